@@ -1,7 +1,7 @@
 """The bundled example: a small production hall full of machines, racks and shelves.
 
 The hall measures 8 x 18 x 2.5 m and has one station in each top corner. Its clutter is inspired by the indoor
-industrial scenario of 5G-ACIA (machines, racks and shelves up to just below the ceiling); seven tenths of the
+industrial scenario of 5G-ACIA (machines, racks and shelves up to just below the ceiling); two thirds of the
 station-to-position pairs have no line of sight.
 """
 
@@ -39,30 +39,30 @@ def hall_boxes() -> list[Box]:
     """Solids of the hall's clutter: machines, cabinets, racks, a conveyor and two pillars."""
     boxes: list[Box] = []
     machines = [
-        ((1.1, 1.6), (2.7, 3.1), 2.2),
-        ((4.9, 1.2), (6.6, 2.5), 2.1),
-        ((5.6, 4.3), (7.0, 6.1), 2.3),
-        ((0.9, 5.2), (2.3, 6.8), 2.1),
-        ((1.0, 11.1), (2.6, 12.5), 2.3),
-        ((5.3, 11.6), (6.8, 13.2), 2.2),
-        ((1.3, 15.0), (2.9, 16.4), 2.1),
-        ((5.1, 15.2), (6.7, 16.6), 2.3),
+        ((1.1, 1.6), (2.5, 3.0), 2.1),
+        ((5.0, 1.3), (6.4, 2.4), 1.9),
+        ((5.6, 4.4), (6.8, 5.9), 2.2),
+        ((1.0, 5.3), (2.2, 6.7), 2.0),
+        ((1.1, 11.2), (2.4, 12.4), 2.2),
+        ((5.4, 11.7), (6.7, 13.0), 2.0),
+        ((1.4, 15.1), (2.7, 16.3), 1.9),
+        ((5.2, 15.3), (6.5, 16.5), 2.2),
     ]
     for i, ((x0, y0), (x1, y1), height) in enumerate(machines, start=1):
         boxes.append(Box(name=f"machine_{i}", material="metal", low=(x0, y0, 0.0), high=(x1, y1, height)))
-        # Each machine has its control cabinet a hand's breadth away.
+        # Each machine has its control cabinet at its side.
         boxes.append(
             Box(
                 name=f"cabinet_{i}",
                 material="metal",
-                low=(x1 + 0.12, y0 + 0.15, 0.0),
-                high=(x1 + 0.52, y0 + 0.75, 1.9),
+                low=(x1 + 0.01, y0 + 0.2, 0.0),
+                high=(x1 + 0.41, y0 + 0.8, 1.6),
             )
         )
     boxes.extend(_rack("rack_1", (3.55, 3.9), (4.25, 6.9)))
     boxes.extend(_rack("rack_2", (3.6, 10.9), (4.3, 13.9)))
-    boxes.extend(_rack("rack_3", (1.2, 8.5), (3.6, 9.1)))
-    boxes.extend(_rack("rack_4", (4.6, 8.7), (7.0, 9.3)))
+    boxes.extend(_rack("rack_3", (1.2, 8.5), (3.3, 9.1)))
+    boxes.extend(_rack("rack_4", (4.6, 8.7), (6.7, 9.3)))
     boxes.append(Box(name="conveyor", material="metal", low=(3.9, 15.2, 0.0), high=(4.5, 17.0, 0.9)))
     boxes.append(Box(name="pillar_1", material="concrete", low=(3.7, 7.7, 0.0), high=(4.1, 8.1, 2.5)))
     boxes.append(Box(name="pillar_2", material="concrete", low=(3.8, 14.2, 0.0), high=(4.2, 14.6, 2.5)))
@@ -104,7 +104,7 @@ def _rack(name: str, low: tuple[float, float], high: tuple[float, float]) -> lis
     """Build a rack: two end panels, four boards, and goods on the boards with gaps between them."""
     (x0, y0), (x1, y1) = low, high
     along_x = x1 - x0 > y1 - y0
-    height, thickness = 2.35, 0.04
+    height, thickness = 2.1, 0.04
     start, end = (x0, x1) if along_x else (y0, y1)
 
     def span(a: float, b: float, z0: float, z1: float, part: str, material: str, inset: float = 0.0) -> Box:
@@ -116,7 +116,7 @@ def _rack(name: str, low: tuple[float, float], high: tuple[float, float]) -> lis
         span(start, start + thickness, 0.0, height, "end_1", "metal"),
         span(end - thickness, end, 0.0, height, "end_2", "metal"),
     ]
-    levels = [0.1, 0.85, 1.6, height - thickness]
+    levels = [0.05, 0.75, 1.4, height - thickness]
     inner_start, inner_end = start + thickness, end - thickness
     for i, z in enumerate(levels):
         boxes.append(span(inner_start, inner_end, z, z + thickness, f"board_{i + 1}", "metal"))
@@ -129,7 +129,7 @@ def _rack(name: str, low: tuple[float, float], high: tuple[float, float]) -> lis
             a = inner_start + j * width
             boxes.append(
                 span(
-                    a + 0.03, a + width - 0.03, z + thickness, z + 0.62, f"goods_{i + 1}{j + 1}", "wood", inset=0.04
+                    a + 0.03, a + width - 0.03, z + thickness, z + 0.6, f"goods_{i + 1}{j + 1}", "wood", inset=0.04
                 )
             )
     return boxes

@@ -1,0 +1,128 @@
+"""The path-selection prior: which of the paths to a place a station reports.
+
+At a place x that paths k reach with power gains g_k, path k is reported with probability
+``pi_k(x) = g_k^beta / sum_j g_j^beta``. The sum is a voxel map, filled by all rays of an isotropic launch: a ray that
+stands for the solid angle dOmega fills ``s^2 dOmega ds`` of space between the lengths s and s + ds.
+"""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.launch import RaySet, Segments
+from rayfix_tables.freespace import FreeSpace
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainModel:
+    """Power gain of a path, relative to 1 m of free space.
+
+    Attributes
+    ----------
+    loss_db : float
+        Loss of each reflection.
+    exponent : float
+        beta; 0 takes any path for as likely, a large one only the strongest.
+    """
+
+    loss_db: float
+    exponent: float
+
+    def reflection_factors(self, max_reflections: int) -> NDArray[np.float64]:
+        """Factor that 0, 1, 2, ... reflections put on gain^beta, shape (max_reflections + 1,)."""
+        return np.asarray(10.0 ** (-0.1 * self.loss_db * self.exponent * np.arange(max_reflections + 1)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathPrior:
+    """The sum of gain^beta over all paths to a voxel.
+
+    Attributes
+    ----------
+    origin : ndarray of shape (3,), m
+    voxel_size : float, m
+    total : ndarray of shape (nx, ny, nz)
+        Mean over the voxel's free part; 0 where no ray comes.
+    coverage : tuple of float
+        Share of the free voxels that are reached with at most 0, 1, 2, ... reflections.
+    """
+
+    origin: NDArray[np.float64]
+    voxel_size: float
+    total: NDArray[np.float64]
+    coverage: tuple[float, ...]
+
+
+def fill_path_prior(
+    rays: RaySet, segments: Segments, gain: GainModel, free_space: FreeSpace, *, refinement: int
+) -> PathPrior:
+    """Fill the voxel map of one station.
+
+    Parameters
+    ----------
+    refinement : int
+        A voxel of the map is this many voxels of the free space wide.
+    """
+    voxel_size = free_space.voxel_size * refinement
+    shape = -(-np.array(free_space.free.shape) // refinement)
+    padded = np.zeros(shape * refinement, bool)
+    nx, ny, nz = free_space.free.shape
+    padded[:nx, :ny, :nz] = free_space.free
+    blocks = padded.reshape(shape[0], refinement, shape[1], refinement, shape[2], refinement)
+    free_share = blocks.mean(axis=(1, 3, 5))
+    depths = segments.sequence.shape[1]
+    power = np.zeros(tuple(shape))
+    first_reached = np.full(tuple(shape), depths, np.int8)
+    _fill(
+        segments.sequence,
+        segments.start,
+        segments.end,
+        segments.sequences.images,
+        segments.sequences.mirrors,
+        rays.directions,
+        rays.solid_angle,
+        gain.reflection_factors(depths - 1),
+        gain.exponent,
+        free_space.origin,
+        voxel_size,
+        power,
+        first_reached,
+    )
+    # A voxel that a solid cuts is lit over its free part only; at least one free-space voxel's worth.
+    total = power / voxel_size**3 / np.maximum(free_share, 1.0 / refinement**3)
+    free = free_share > 0.5
+    count = max(1, int(np.count_nonzero(free)))
+    coverage = tuple(float(np.count_nonzero(free & (first_reached <= k)) / count) for k in range(depths))
+    return PathPrior(origin=free_space.origin, voxel_size=voxel_size, total=total, coverage=coverage)
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill(
+    sequence, start, end, images, mirrors, directions, solid_angle, factors, exponent, origin, voxel, power, reached
+):  # type: ignore[no-untyped-def]
+    nx, ny, nz = power.shape
+    heading = np.empty(3)
+    for ray in range(sequence.shape[0]):
+        for depth in range(sequence.shape[1]):
+            seq = sequence[ray, depth]
+            if seq < 0:
+                break
+            for i in range(3):
+                heading[i] = (
+                    mirrors[seq, i, 0] * directions[ray, 0]
+                    + mirrors[seq, i, 1] * directions[ray, 1]
+                    + mirrors[seq, i, 2] * directions[ray, 2]
+                )
+            span = end[ray, depth] - start[ray, depth]
+            steps = int(np.ceil(span / (0.5 * voxel)))
+            for step in range(steps):
+                length = start[ray, depth] + (step + 0.5) * span / steps
+                ix = int(np.floor((images[seq, 0] + length * heading[0] - origin[0]) / voxel))
+                iy = int(np.floor((images[seq, 1] + length * heading[1] - origin[1]) / voxel))
+                iz = int(np.floor((images[seq, 2] + length * heading[2] - origin[2]) / voxel))
+                if 0 <= ix < nx and 0 <= iy < ny and 0 <= iz < nz:
+                    volume = solid_angle[ray] * length * length * span / steps
+                    power[ix, iy, iz] += volume * factors[depth] * length ** (-2.0 * exponent)
+                    reached[ix, iy, iz] = min(reached[ix, iy, iz], depth)

@@ -1,0 +1,77 @@
+"""Coplanar triangles as one mirror plane."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+TOLERANCE = 1e-3
+"""Triangles whose planes differ by less than this over the whole scene are coplanar, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planes:
+    """The mirror planes of a scene, ``normal . x = offset``.
+
+    Attributes
+    ----------
+    normals : ndarray of shape (n_planes, 3)
+        Unit normals; either side reflects.
+    offsets : ndarray of shape (n_planes,), m
+    face_planes : ndarray of int32, shape (n_faces,)
+        Plane of each triangle.
+    """
+
+    normals: NDArray[np.float64]
+    offsets: NDArray[np.float64]
+    face_planes: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Return the number of planes."""
+        return len(self.offsets)
+
+
+def merge_coplanar(triangles: NDArray[np.float64], *, tolerance: float = TOLERANCE) -> Planes:
+    """Find the planes of triangles; triangles of one plane need not touch.
+
+    Parameters
+    ----------
+    triangles : ndarray of shape (n_faces, 3, 3), m
+    tolerance : float, m
+        Largest distance between merged planes anywhere within the scene.
+    """
+    corners = triangles.reshape(-1, 3)
+    centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    radius = float(np.linalg.norm(corners - centre, axis=1).max())
+    crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    areas = np.linalg.norm(crosses, axis=1)
+    normals = crosses / areas[:, None]
+    offsets = np.einsum("ij,ij->i", normals, triangles.mean(axis=1) - centre)
+
+    # A plane has two normals: both go in, and belong together, so that no sign convention can split a plane.
+    features = np.concatenate([normals * radius, offsets[:, None]], axis=1)
+    both = np.concatenate([features, -features])
+    rounded, inverse = np.unique(np.round(both / (tolerance * 1e-3)), axis=0, return_inverse=True)
+    pairs = cKDTree(rounded * (tolerance * 1e-3)).query_pairs(tolerance, output_type="ndarray")
+    count = len(triangles)
+    links = np.concatenate([pairs, np.stack([inverse[:count], inverse[count:]], axis=1)])
+    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(len(rounded), len(rounded)))
+    _, labels = connected_components(graph, directed=False)
+    _, first, face_planes = np.unique(labels[inverse[:count]], return_index=True, return_inverse=True)
+
+    # The mean over the plane's area: all rays of one reflection sequence then share one exact mirror image.
+    signs = np.sign(np.einsum("ij,ij->i", normals, normals[first][face_planes]))
+    plane_normals = np.zeros((len(first), 3))
+    np.add.at(plane_normals, face_planes, normals * (signs * areas)[:, None])
+    plane_normals /= np.linalg.norm(plane_normals, axis=1)[:, None]
+    middle = np.zeros((len(first), 3))
+    np.add.at(middle, face_planes, triangles.mean(axis=1) * areas[:, None])
+    middle /= np.bincount(face_planes, weights=areas)[:, None]
+    return Planes(
+        normals=plane_normals,
+        offsets=np.einsum("ij,ij->i", plane_normals, middle),
+        face_planes=face_planes.astype(np.int32),
+    )

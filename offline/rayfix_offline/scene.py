@@ -1,0 +1,152 @@
+"""The scene: a mesh file as triangles in metres, z up, with the objects and materials they belong to."""
+
+import contextlib
+import hashlib
+import io
+import logging
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from rayfix_tables.errors import SceneError
+
+METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+FILE_TYPES = ("glb", "gltf", "obj", "ply", "stl", "dae")
+
+_TRIMESH_UNITS = {"meters": 1.0, "m": 1.0, "centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "feet": 0.3048}
+_MIN_AREA = 1e-12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Triangles of the digital twin.
+
+    Attributes
+    ----------
+    vertices : ndarray of shape (n_vertices, 3), m
+    faces : ndarray of int32, shape (n_faces, 3)
+        Degenerate triangles are already left out.
+    face_materials : ndarray of int16, shape (n_faces,)
+        Index into ``materials``; -1 for none.
+    face_objects : ndarray of int32, shape (n_faces,)
+        Index into ``objects``, the names of the file's meshes.
+    num_degenerate : int
+        Triangles without an area, left out.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    face_materials: NDArray[np.int16]
+    materials: tuple[str, ...]
+    face_objects: NDArray[np.int32]
+    objects: tuple[str, ...]
+    num_degenerate: int = 0
+
+    @property
+    def triangles(self) -> NDArray[np.float64]:
+        """Corners of the triangles, shape (n_faces, 3, 3), m."""
+        return self.vertices[self.faces]
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Low and high corner, shape (2, 3), m."""
+        used = self.vertices[np.unique(self.faces)]
+        return np.stack([used.min(axis=0), used.max(axis=0)])
+
+    @property
+    def sha256(self) -> str:
+        """Checksum of the geometry and its materials."""
+        digest = hashlib.sha256("\0".join(self.materials).encode())
+        for array in (self.vertices, self.faces, self.face_materials):
+            digest.update(f"{array.dtype.str}{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+
+def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
+    """Read a mesh file.
+
+    Parameters
+    ----------
+    unit : {"m", "cm", "mm", "in", "ft"}
+        Unit of the coordinates, unless the file itself says it (COLLADA does).
+    up : {"z", "y"}
+        Which axis of the file points up; "y" is turned to z.
+
+    Raises
+    ------
+    SceneError
+        When the file is missing, cannot be read, or holds no triangles.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SceneError(f"there is no scene at {path}; correct 'scene' in the site file (it is relative to that file)")
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in FILE_TYPES:
+        raise SceneError(f"{path} is of unknown type '{kind}'; give one of {', '.join(FILE_TYPES)}")
+    loaded = _load_quietly(path)
+    meshes: list[tuple[str, Any, Any]] = []
+    for node in loaded.graph.nodes_geometry:
+        transform, name = loaded.graph[node]
+        geometry = loaded.geometry[name]
+        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+            meshes.append((str(node), geometry, transform))
+    if not meshes:
+        raise SceneError(f"{path} holds no triangles; export the scene as a triangle mesh")
+    scale = _TRIMESH_UNITS.get(str(loaded.units), METRES_PER_UNIT[unit]) if kind == "dae" else METRES_PER_UNIT[unit]
+    scene = _gather(meshes, scale=scale, up=up)
+    if not np.all(np.isfinite(scene.vertices)):
+        raise SceneError(f"{path} has coordinates that are not finite; export the scene again")
+    if not len(scene.faces):
+        raise SceneError(f"{path} has only triangles without an area; export the scene again")
+    return scene
+
+
+def _load_quietly(path: Path) -> Any:
+    """Read with trimesh, whose readers print, log and warn about what the result shows anyway."""
+    previous = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            return trimesh.load_scene(path, process=False)
+    except Exception as error:  # the readers raise whatever their formats make of a damaged file
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise SceneError(f"{path} cannot be read as a mesh ({reason}); export the scene again") from error
+    finally:
+        logging.disable(previous)
+
+
+def _gather(meshes: list[tuple[str, Any, Any]], *, scale: float, up: str) -> Scene:
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) if up == "y" else np.eye(3)
+    vertices, faces, face_materials, face_objects = [], [], [], []
+    materials: list[str] = []
+    count = 0
+    for index, (_, mesh, transform) in enumerate(meshes):
+        points = trimesh.transformations.transform_points(np.asarray(mesh.vertices, np.float64), transform)
+        vertices.append(points @ turn.T * scale)
+        faces.append(np.asarray(mesh.faces, np.int64) + count)
+        count += len(points)
+        material = getattr(getattr(mesh.visual, "material", None), "name", None)
+        if material and material not in materials:
+            materials.append(material)
+        face_materials.append(np.full(len(mesh.faces), materials.index(material) if material else -1))
+        face_objects.append(np.full(len(mesh.faces), index))
+    all_vertices = np.concatenate(vertices)
+    all_faces = np.concatenate(faces)
+    a, b, c = (all_vertices[all_faces[:, i]] for i in range(3))
+    keep = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 2.0 * _MIN_AREA
+    return Scene(
+        vertices=all_vertices,
+        faces=all_faces[keep].astype(np.int32),
+        face_materials=np.concatenate(face_materials)[keep].astype(np.int16),
+        materials=tuple(materials),
+        face_objects=np.concatenate(face_objects)[keep].astype(np.int32),
+        objects=tuple(name for name, _, _ in meshes),
+        num_degenerate=int(np.count_nonzero(~keep)),
+    )

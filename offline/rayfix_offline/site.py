@@ -1,0 +1,171 @@
+"""The site file: what to build, where the stations are, how waves travel there."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rayfix_tables.errors import SiteError
+from rayfix_tables.site import SiteInfo, Station
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Triple = tuple[Finite, Finite, Finite]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SiteSection(_Section):
+    """``[site]``: the scene and how to read it."""
+
+    name: Annotated[str, Field(min_length=1, max_length=100)]
+    scene: Annotated[str, Field(min_length=1)]
+    scene_unit: Literal["m", "cm", "mm", "in", "ft"] = "m"
+    scene_up: Literal["z", "y"] = "z"
+    north_deg: Annotated[float, Field(ge=-360, le=360)] = 90.0
+
+
+class PropagationSection(_Section):
+    """``[propagation]``: which paths there are and which of them a station reports."""
+
+    carrier_ghz: Annotated[float, Field(gt=0, le=1000)] = 3.5
+    max_reflections: Annotated[int, Field(ge=0, le=8)] = 3
+    max_path_length_m: Annotated[float, Field(gt=0, le=10_000)] = 60.0
+    reflection_loss_db: Annotated[float, Field(ge=0, le=100)] = 6.0
+    path_prior: Literal["power", "uniform", "paper"] = "power"
+    path_prior_exponent: Annotated[float, Field(ge=0, le=20)] = 2.0
+
+
+class TableSection(_Section):
+    """``[table]``: how finely the table is cut."""
+
+    windows_deg: Annotated[tuple[Annotated[float, Field(ge=0.1, le=30)], ...], Field(min_length=1)] = (1.25, 5.0, 15.0)
+    fit: Literal["tubes", "em"] = "tubes"
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+
+    @model_validator(mode="after")
+    def _windows_ascend(self) -> "TableSection":
+        if any(b <= a for a, b in zip(self.windows_deg, self.windows_deg[1:], strict=False)):
+            raise ValueError("windows_deg must grow from each window to the next, e.g. [1.25, 5.0, 15.0]")
+        return self
+
+
+class StationSection(_Section):
+    """``[[stations]]``: one base station, anchor or locator."""
+
+    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}$")]
+    position_m: Triple
+    orientation_deg: Triple = (0.0, 0.0, 0.0)
+    field_of_view_deg: Annotated[float, Field(gt=0, le=360)] = 360.0
+
+
+class SiteFile(_Section):
+    """A whole site file."""
+
+    site: SiteSection
+    propagation: PropagationSection = PropagationSection()
+    table: TableSection = TableSection()
+    stations: Annotated[tuple[StationSection, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _ids_differ(self) -> "SiteFile":
+        ids = [station.id for station in self.stations]
+        twice = sorted({i for i in ids if ids.count(i) > 1})
+        if twice:
+            raise ValueError(f"station ids must differ; more than one station is called {', '.join(twice)}")
+        return self
+
+    def info(self) -> SiteInfo:
+        """Return what the table keeps of the site."""
+        return SiteInfo(
+            name=self.site.name,
+            north=float(np.deg2rad(self.site.north_deg)),
+            max_path_length=self.propagation.max_path_length_m,
+            stations=tuple(
+                Station(
+                    id=s.id,
+                    position=s.position_m,
+                    orientation=_radians(s.orientation_deg),
+                    field_of_view=float(np.deg2rad(s.field_of_view_deg)),
+                )
+                for s in self.stations
+            ),
+            document=self.model_dump(mode="json"),
+        )
+
+
+def read_site(path: str | Path) -> SiteFile:
+    """Read and validate a site file.
+
+    Raises
+    ------
+    SiteError
+        When the file is missing, is not TOML, or does not fit; the message names every offending key.
+    """
+    path = Path(path)
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise SiteError(f"there is no site file at {path}; 'rayfix example DIR' writes one to start from") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SiteError(f"{path} cannot be read ({error}); give a TOML site file") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SiteError(f"{path} is not valid TOML: {error}") from error
+    return parse_site(document, source=str(path))
+
+
+def parse_site(document: dict[str, Any], *, source: str = "site") -> SiteFile:
+    """Validate the content of a site file.
+
+    Parameters
+    ----------
+    source : str
+        How messages call the file.
+
+    Raises
+    ------
+    SiteError
+        When it does not fit; the message names every offending key.
+    """
+    try:
+        return SiteFile.model_validate(document)
+    except ValidationError as error:
+        problems = "; ".join(_problem(e) for e in error.errors())
+        raise SiteError(f"{source}: {problems}") from error
+
+
+def _problem(error: Any) -> str:
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]).lstrip(".")
+    if error["type"] == "extra_forbidden":
+        section = ".".join(str(part) for part in error["loc"][:-1] if isinstance(part, str))
+        known = _known_keys(error["loc"][:-1])
+        return f"unknown key {key}; {f'[{section}]' if section else 'the file'} knows {', '.join(known)}"
+    if error["type"] == "missing":
+        return f"{key} is missing"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    if error["type"] == "value_error":
+        return f"{key}: {message}" if key else message
+    return f"{key} = {error['input']!r}: {message[0].lower()}{message[1:]}"
+
+
+def _known_keys(location: tuple[str | int, ...]) -> list[str]:
+    model: type[BaseModel] = SiteFile
+    sections = {
+        "site": SiteSection,
+        "propagation": PropagationSection,
+        "table": TableSection,
+        "stations": StationSection,
+    }
+    for part in location:
+        if isinstance(part, str) and part in sections:
+            model = sections[part]
+    return list(model.model_fields)
+
+
+def _radians(degrees: Triple) -> Triple:
+    a, b, c = (float(v) for v in np.deg2rad(degrees))
+    return (a, b, c)

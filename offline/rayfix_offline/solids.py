@@ -1,0 +1,189 @@
+"""Closed parts of the scene: solids, in which nothing can be, and enclosures, outside of which nothing can be."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from rayfix_offline.scene import Scene
+from rayfix_tables.freespace import FreeSpace
+
+MAX_VOXELS = 20_000_000
+"""The free space of a large building is cut more coarsely rather than into more voxels than this."""
+
+_WELD = 1e-6
+_ENCLOSURE_SHARE = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """A connected part of the scene's surface.
+
+    Attributes
+    ----------
+    name : str
+        Object of the scene file that it (mostly) belongs to.
+    faces : ndarray of int64, shape (n,)
+        Its triangles in the scene.
+    closed : bool
+        Every edge belongs to an even number of triangles, so that it has an inside.
+    consistent : bool
+        Every edge is run through once in each direction, so that all triangles face the same way.
+    volume : float, m3
+        Signed: positive where the triangles face outwards.
+    """
+
+    name: str
+    faces: NDArray[np.int64]
+    closed: bool
+    consistent: bool
+    volume: float
+
+
+def split_parts(scene: Scene) -> tuple[Part, ...]:
+    """Cut the scene into connected parts; vertices less than a micrometre apart count as one."""
+    _, welded = np.unique(np.round(scene.vertices / _WELD), axis=0, return_inverse=True)
+    faces = welded.reshape(-1)[scene.faces]
+    links = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    count = int(faces.max()) + 1
+    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    of_face = label[faces[:, 0]]
+    order = np.argsort(of_face, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(of_face[order])) + 1)
+    return tuple(_part(scene, faces, group) for group in groups)
+
+
+def _part(scene: Scene, welded_faces: NDArray[np.int64], chosen: NDArray[np.int64]) -> Part:
+    faces = welded_faces[chosen]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forward = edges[:, 0] < edges[:, 1]
+    _, inverse, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    balance = np.bincount(inverse.reshape(-1), weights=np.where(forward, 1.0, -1.0))
+    corners = scene.triangles[chosen]
+    middle = corners.reshape(-1, 3).mean(axis=0)
+    a, b, c = (corners[:, i] - middle for i in range(3))
+    names = np.bincount(scene.face_objects[chosen])
+    return Part(
+        name=scene.objects[int(names.argmax())],
+        faces=chosen,
+        closed=bool(np.all(uses % 2 == 0)),
+        consistent=bool(np.all(balance == 0)),
+        volume=float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0),
+    )
+
+
+def is_inside(triangles: NDArray[np.float64], point: NDArray[np.float64]) -> bool:
+    """Whether a point lies inside a closed surface, however its triangles face.
+
+    Counts the crossings of three rays in directions that no building has, and takes the majority.
+
+    Parameters
+    ----------
+    triangles : ndarray of shape (n, 3, 3), m
+    point : ndarray of shape (3,), m
+    """
+    a = triangles[:, 0]
+    ab, ac = triangles[:, 1] - a, triangles[:, 2] - a
+    votes = 0
+    for heading in ((0.5257, 0.3113, 0.7917), (-0.6121, 0.7034, 0.3613), (0.2731, -0.8467, -0.4566)):
+        ray = np.asarray(heading)
+        across = np.cross(ray, ac)
+        det = np.einsum("ij,ij->i", ab, across)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.einsum("ij,ij->i", point - a, across) / det
+            turned = np.cross(point - a, ab)
+            v = turned @ ray / det
+            reach = np.einsum("ij,ij->i", ac, turned) / det
+            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (reach > 0)
+        votes += int(np.count_nonzero(hit) % 2)
+    return votes >= 2
+
+
+def find_enclosures(
+    scene: Scene, parts: Sequence[Part], stations: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Tell which closed parts enclose the site, and which stations lie in which parts.
+
+    A part that holds more than half of the stations and a good share of the scene's volume is the building itself (or
+    the inner or outer face of its walls); every other closed part is a solid.
+
+    Parameters
+    ----------
+    stations : ndarray of shape (n_stations, 3), m
+
+    Returns
+    -------
+    enclosing : ndarray of bool, shape (n_parts,)
+    inside : ndarray of bool, shape (n_parts, n_stations)
+    """
+    scene_volume = float(np.prod(np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)))
+    inside = np.zeros((len(parts), len(stations)), bool)
+    enclosing = np.zeros(len(parts), bool)
+    for i, part in enumerate(parts):
+        if not part.closed:
+            continue
+        triangles = scene.triangles[part.faces]
+        low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+        for s in np.flatnonzero(np.all((stations >= low) & (stations <= high), axis=1)):
+            inside[i, s] = is_inside(triangles, stations[s])
+        enclosing[i] = inside[i].mean() > 0.5 and abs(part.volume) > _ENCLOSURE_SHARE * scene_volume
+    return enclosing, inside
+
+
+def map_free_space(
+    scene: Scene, parts: Sequence[Part], enclosing: NDArray[np.bool_], *, voxel_size: float
+) -> FreeSpace:
+    """Mark the voxels whose centres lie inside all enclosures and outside all solids.
+
+    Parameters
+    ----------
+    voxel_size : float, m
+        Grows when the scene would take more than MAX_VOXELS.
+    """
+    low, high = scene.bounds
+    extent = np.maximum(high - low, voxel_size)
+    voxel_size = max(voxel_size, float((np.prod(extent) / MAX_VOXELS) ** (1.0 / 3.0)))
+    shape = tuple(int(n) for n in np.ceil(extent / voxel_size - 1e-9))
+    free = np.ones(shape, bool)
+    for part, encloses in zip(parts, enclosing, strict=True):
+        if part.closed:
+            parity = np.zeros(shape, bool)
+            _flip_above(scene.triangles[part.faces], low, voxel_size, parity)
+            free &= parity if encloses else ~parity
+    return FreeSpace(origin=low, voxel_size=voxel_size, free=free)
+
+
+@numba.njit(cache=True, nogil=True)
+def _flip_above(triangles, origin, voxel, parity):  # type: ignore[no-untyped-def]
+    """Flip the voxels whose centres lie above each triangle: at the end those inside are set."""
+    nx, ny, nz = parity.shape
+    # Columns a hair off the voxels' centres, so that they meet no edge of a drawing on round coordinates.
+    shift_x, shift_y = 0.5 + 1.37e-5, 0.5 + 2.71e-5
+    for t in range(len(triangles)):
+        ax, ay, az = triangles[t, 0]
+        bx, by, bz = triangles[t, 1]
+        cx, cy, cz = triangles[t, 2]
+        det = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+        if det == 0.0:
+            continue
+        first_x = max(0, int(np.floor((min(ax, bx, cx) - origin[0]) / voxel - shift_x)))
+        last_x = min(nx - 1, int(np.ceil((max(ax, bx, cx) - origin[0]) / voxel - shift_x)))
+        first_y = max(0, int(np.floor((min(ay, by, cy) - origin[1]) / voxel - shift_y)))
+        last_y = min(ny - 1, int(np.ceil((max(ay, by, cy) - origin[1]) / voxel - shift_y)))
+        for ix in range(first_x, last_x + 1):
+            x = origin[0] + (ix + shift_x) * voxel
+            for iy in range(first_y, last_y + 1):
+                y = origin[1] + (iy + shift_y) * voxel
+                u = ((x - ax) * (cy - ay) - (cx - ax) * (y - ay)) / det
+                v = ((bx - ax) * (y - ay) - (x - ax) * (by - ay)) / det
+                if u < 0.0 or v < 0.0 or u + v > 1.0:
+                    continue
+                z = az + u * (bz - az) + v * (cz - az)
+                start = max(0, int(np.ceil((z - origin[2]) / voxel - 0.5)))
+                for iz in range(start, nz):
+                    parity[ix, iy, iz] = not parity[ix, iy, iz]

@@ -1,0 +1,116 @@
+"""All rays of one station, traced once and cut into the pieces that its cells share."""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from rayfix_offline.launch import RaySet, Sequences, launch, sample_rays, thin
+from rayfix_offline.pathprior import GainModel, fill_path_prior
+from rayfix_offline.pieces import Pieces, cut_pieces
+from rayfix_offline.site import SiteFile, StationSection
+from rayfix_offline.twin import Twin
+from rayfix_tables.grid import AngularGrid
+
+RAYS_PER_WINDOW = 3.0
+"""Rays lie this many times as close as the finest window's standard deviation."""
+
+RAYS_PER_WIDE_WINDOW = 6.0
+"""The same for the wider windows, which have few cells."""
+
+CELLS_PER_WINDOW = 0.8
+"""Cells are this many times as close as their window's standard deviation."""
+
+SLICE_RATIO = 1.35
+"""Ratio of a slice's length to the one before."""
+
+INTEGRATION_STEP = 0.1
+"""Longest step of the integration along a ray, m."""
+
+PRIOR_REFINEMENT = 2
+"""A voxel of the path prior is this many voxels of the free space wide."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelRays:
+    """What the cells of one level are fitted to.
+
+    Attributes
+    ----------
+    window : float, rad
+        Standard deviation of the cells' window.
+    ray_spacing : float, rad
+    """
+
+    window: float
+    grid: AngularGrid
+    rays: RaySet
+    ray_spacing: float
+    pieces: Pieces
+    sequences: Sequences
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationTrace:
+    """A station's rays by level, finest first, and what the launch found out.
+
+    Attributes
+    ----------
+    lost_ray_share : float
+        Share of the rays that left the scene instead of hitting a surface.
+    coverage : tuple of float
+        Share of the free space that is reached with at most 0, 1, 2, ... reflections.
+    """
+
+    levels: tuple[LevelRays, ...]
+    lost_ray_share: float
+    coverage: tuple[float, ...]
+
+
+def trace_station(station: StationSection, site: SiteFile, twin: Twin) -> StationTrace:
+    """Launch a station's rays and cut them into pieces.
+
+    The directions depend on the site's seed and the station's id alone.
+    """
+    windows = np.deg2rad(site.table.windows_deg)
+    spacing = float(windows[0]) / RAYS_PER_WINDOW
+    name = int.from_bytes(hashlib.sha256(station.id.encode()).digest()[:8], "big")
+    rays = sample_rays(spacing, np.random.default_rng([site.table.seed, name]))
+    segments = launch(
+        np.array(station.position_m),
+        rays.directions,
+        engine=twin.engine,
+        planes=twin.planes,
+        bounds=twin.scene.bounds,
+        max_reflections=site.propagation.max_reflections,
+        max_path_length=site.propagation.max_path_length_m,
+    )
+    gain = GainModel(loss_db=site.propagation.reflection_loss_db, exponent=site.propagation.path_prior_exponent)
+    prior = fill_path_prior(rays, segments, gain, twin.free_space, refinement=PRIOR_REFINEMENT)
+    pieces = cut_pieces(
+        rays,
+        segments,
+        gain,
+        prior,
+        kind=site.propagation.path_prior,
+        slice_ratio=SLICE_RATIO,
+        step=INTEGRATION_STEP,
+    )
+    levels = []
+    for window in (float(w) for w in windows):
+        level_rays, level_pieces, level_spacing = rays, pieces, spacing
+        if window / RAYS_PER_WIDE_WINDOW >= 2.0 * spacing:
+            level_spacing = window / RAYS_PER_WIDE_WINDOW
+            level_rays, index = thin(rays, level_spacing)
+            level_pieces = pieces.of_rays(index)
+        levels.append(
+            LevelRays(
+                window=window,
+                grid=AngularGrid.from_spacing(window / CELLS_PER_WINDOW),
+                rays=level_rays,
+                ray_spacing=level_spacing,
+                pieces=level_pieces,
+                sequences=segments.sequences,
+            )
+        )
+    return StationTrace(levels=tuple(levels), lost_ray_share=segments.lost_ray_share, coverage=prior.coverage)

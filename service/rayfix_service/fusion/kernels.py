@@ -1,0 +1,411 @@
+"""Compiled kernels of the fusion. :mod:`rayfix_service.fusion.reference` holds their plain NumPy twins.
+
+A *factor* is what one path of the report says of the state ``z = (x, clock offsets)``: an alternative of it is
+``exp(log_scale + eta . z - z . information . z / 2)``, for one component of the table's cell.
+"""
+
+import numba
+import numpy as np
+
+LOG_2PI = 1.8378770664093453
+
+
+@numba.njit(cache=True, nogil=True)
+def condition_on_angle(
+    log_weight, u_mean, u_cov, x_mean, jacobian, x_cov, rest_mean, rest_cov, log_factor, out_log, out_mean, out_cov
+):  # type: ignore[no-untyped-def]
+    """Condition a cell's components on the rest of the measured angle.
+
+    Parameters
+    ----------
+    log_weight, u_mean, u_cov, x_mean, jacobian, x_cov : ndarray
+        Fields of a :class:`~rayfix_tables.mixture.TubeMixture` of k components.
+    rest_mean : ndarray of shape (2,)
+    rest_cov : ndarray of shape (3,)
+        Packed: horizontal variance, covariance, vertical variance.
+    log_factor : float
+        Added to every weight.
+    out_log : ndarray of shape (k,)
+        Log evidence of each component.
+    out_mean : ndarray of shape (k, 4)
+        Mean of (x, path length).
+    out_cov : ndarray of shape (k, 4, 4)
+    """
+    u = np.empty(3)
+    cov = np.empty((3, 3))
+    cross = np.empty((3, 3))
+    for k in range(len(log_weight)):
+        p00, p01, p02 = np.float64(u_cov[k, 0]), np.float64(u_cov[k, 1]), np.float64(u_cov[k, 2])
+        p11, p12, p22 = np.float64(u_cov[k, 3]), np.float64(u_cov[k, 4]), np.float64(u_cov[k, 5])
+        s11, s12, s22 = p11 + rest_cov[0], p12 + rest_cov[1], p22 + rest_cov[2]
+        det = s11 * s22 - s12 * s12
+        i11, i12, i22 = s22 / det, -s12 / det, s11 / det
+        r1 = rest_mean[0] - u_mean[k, 1]
+        r2 = rest_mean[1] - u_mean[k, 2]
+        g1 = i11 * r1 + i12 * r2
+        g2 = i12 * r1 + i22 * r2
+        out_log[k] = log_factor + log_weight[k] - 0.5 * (r1 * g1 + r2 * g2 + np.log(det)) - LOG_2PI
+        column1 = (p01, p11, p12)
+        column2 = (p02, p12, p22)
+        prior = ((p00, p01, p02), (p01, p11, p12), (p02, p12, p22))
+        for i in range(3):
+            u[i] = column1[i] * g1 + column2[i] * g2
+            k1 = column1[i] * i11 + column2[i] * i12
+            k2 = column1[i] * i12 + column2[i] * i22
+            for j in range(3):
+                cov[i, j] = prior[i][j] - k1 * column1[j] - k2 * column2[j]
+        for i in range(3):
+            moved = np.float64(x_mean[k, i])
+            for j in range(3):
+                moved += jacobian[k, i, j] * u[j]
+                total = 0.0
+                for m in range(3):
+                    total += jacobian[k, i, m] * cov[m, j]
+                cross[i, j] = total
+            out_mean[k, i] = moved
+        out_mean[k, 3] = u_mean[k, 0] + u[0]
+        packed = 0
+        for i in range(3):
+            for j in range(i, 3):
+                total = np.float64(x_cov[k, packed])
+                packed += 1
+                for m in range(3):
+                    total += cross[i, m] * jacobian[k, j, m]
+                out_cov[k, i, j] = total
+                out_cov[k, j, i] = total
+            out_cov[k, i, 3] = cross[i, 0]
+            out_cov[k, 3, i] = cross[i, 0]
+        out_cov[k, 3, 3] = cov[0, 0]
+
+
+@numba.njit(cache=True, nogil=True)
+def condition_on_length(log_evidence, mean, cov, length, variance):  # type: ignore[no-untyped-def]
+    """Condition Gaussians over (x, path length) on a measured path length, in place.
+
+    Parameters
+    ----------
+    log_evidence : ndarray of shape (k,)
+    mean : ndarray of shape (k, 4)
+    cov : ndarray of shape (k, 4, 4)
+    length : float, m
+    variance : float, m2
+    """
+    gain = np.empty(4)
+    for k in range(len(log_evidence)):
+        total = cov[k, 3, 3] + variance
+        apart = length - mean[k, 3]
+        log_evidence[k] -= 0.5 * (apart * apart / total + np.log(total) + LOG_2PI)
+        for i in range(4):
+            gain[i] = cov[k, i, 3]
+        for i in range(4):
+            mean[k, i] += gain[i] * apart / total
+            for j in range(4):
+                cov[k, i, j] -= gain[i] * gain[j] / total
+
+
+@numba.njit(cache=True, nogil=True)
+def cholesky(matrix, lower):  # type: ignore[no-untyped-def]
+    """Cholesky factor into ``lower``; False when the matrix is not positive definite."""
+    size = len(matrix)
+    for j in range(size):
+        pivot = matrix[j, j]
+        for k in range(j):
+            pivot -= lower[j, k] * lower[j, k]
+        if not pivot > 0.0:
+            return False
+        root = np.sqrt(pivot)
+        lower[j, j] = root
+        for i in range(j + 1, size):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= lower[i, k] * lower[j, k]
+            lower[i, j] = value / root
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def invert(lower, inverse):  # type: ignore[no-untyped-def]
+    """Inverse of a matrix from its Cholesky factor, into ``inverse``."""
+    size = len(lower)
+    column = np.empty(size)
+    for c in range(size):
+        for i in range(size):
+            value = 1.0 if i == c else 0.0
+            for k in range(i):
+                value -= lower[i, k] * column[k]
+            column[i] = value / lower[i, i]
+        for i in range(size - 1, -1, -1):
+            value = column[i]
+            for k in range(i + 1, size):
+                value -= lower[k, i] * column[k]
+            column[i] = value / lower[i, i]
+        for i in range(size):
+            inverse[i, c] = column[i]
+
+
+@numba.njit(cache=True, nogil=True)
+def to_information(log_evidence, mean, cov, clocks, offsets, variances, dimension, out_information, out_eta, out_scale):  # type: ignore[no-untyped-def]
+    """Turn Gaussians over (x, path length) into factors over (x, clock offsets), with times of arrival taken in.
+
+    A time of arrival says ``offset = path length + clock + noise``; the path length is integrated out.
+
+    Parameters
+    ----------
+    clocks : ndarray of int64, shape (t,)
+        Clock of each time of arrival; its offset is entry ``3 + clock`` of the state.
+    offsets : ndarray of shape (t,), m
+        Times of arrival, as lengths.
+    variances : ndarray of shape (t,), m2
+    dimension : int
+        Of the state.
+    out_information : ndarray of shape (k, dimension, dimension)
+    out_eta : ndarray of shape (k, dimension)
+    out_scale : ndarray of shape (k,)
+    """
+    size = 4 if len(clocks) else 3
+    lower = np.empty((size, size))
+    inverse = np.empty((size, size))
+    full = np.empty((dimension + 1, dimension + 1))
+    linear = np.empty(dimension + 1)
+    for k in range(len(log_evidence)):
+        cholesky(cov[k, :size, :size], lower)
+        invert(lower, inverse)
+        full[:] = 0.0
+        linear[:] = 0.0
+        # The path length comes last, after the clocks.
+        scale = log_evidence[k] - 0.5 * size * LOG_2PI
+        for i in range(size):
+            scale -= np.log(lower[i, i])
+        square = 0.0
+        for i in range(size):
+            a = i if i < 3 else dimension
+            for j in range(size):
+                b = j if j < 3 else dimension
+                full[a, b] = inverse[i, j]
+                linear[a] += inverse[i, j] * mean[k, j]
+            square += linear[a] * mean[k, i]
+        scale -= 0.5 * square
+        for t in range(len(clocks)):
+            c = 3 + clocks[t]
+            precision = 1.0 / variances[t]
+            full[c, c] += precision
+            full[c, dimension] += precision
+            full[dimension, c] += precision
+            full[dimension, dimension] += precision
+            linear[c] += precision * offsets[t]
+            linear[dimension] += precision * offsets[t]
+            scale -= 0.5 * (offsets[t] * offsets[t] * precision + np.log(variances[t]) + LOG_2PI)
+        if size == 4:
+            pivot = full[dimension, dimension]
+            scale += 0.5 * (linear[dimension] * linear[dimension] / pivot + LOG_2PI - np.log(pivot))
+            for i in range(dimension):
+                out_eta[k, i] = linear[i] - full[i, dimension] * linear[dimension] / pivot
+                for j in range(dimension):
+                    out_information[k, i, j] = full[i, j] - full[i, dimension] * full[dimension, j] / pivot
+        else:
+            for i in range(dimension):
+                out_eta[k, i] = linear[i]
+                for j in range(dimension):
+                    out_information[k, i, j] = full[i, j]
+        out_scale[k] = scale
+
+
+@numba.njit(cache=True, nogil=True)
+def log_integral(information, eta, log_scale, log_volume, lower, solved):  # type: ignore[no-untyped-def]
+    """Logarithm of the integral of a factor over the state; over the volume where nothing constrains the position.
+
+    Parameters
+    ----------
+    lower : ndarray of shape (dimension, dimension)
+        Scratch.
+    solved : ndarray of shape (dimension,)
+        Scratch.
+    """
+    size = len(eta)
+    if information[0, 0] + information[1, 1] + information[2, 2] <= 0.0:
+        total = log_scale + log_volume
+        for i in range(3, size):
+            total += 0.5 * (eta[i] * eta[i] / information[i, i] + LOG_2PI - np.log(information[i, i]))
+        return total
+    if not cholesky(information, lower):
+        return -np.inf
+    total = log_scale + 0.5 * size * LOG_2PI
+    for i in range(size):
+        value = eta[i]
+        for k in range(i):
+            value -= lower[i, k] * solved[k]
+        solved[i] = value / lower[i, i]
+        total += 0.5 * solved[i] * solved[i] - np.log(lower[i, i])
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _sift_down(scores, order, count):  # type: ignore[no-untyped-def]
+    """Restore the heap whose least score is at ``order[0]``, after that entry has changed."""
+    i = 0
+    while True:
+        least = i
+        for child in (2 * i + 1, 2 * i + 2):
+            if child < count and scores[order[child]] < scores[order[least]]:
+                least = child
+        if least == i:
+            return
+        order[i], order[least] = order[least], order[i]
+        i = least
+
+
+@numba.njit(cache=True, nogil=True)
+def extend_beam(information, eta, log_scale, factor_information, factor_eta, factor_scale, width, log_volume):  # type: ignore[no-untyped-def]
+    """Multiply every hypothesis by every alternative of a factor and keep the best products.
+
+    Parameters
+    ----------
+    information : ndarray of shape (h, d, d)
+    eta : ndarray of shape (h, d)
+    log_scale : ndarray of shape (h,)
+    factor_information : ndarray of shape (k, d, d)
+    factor_eta : ndarray of shape (k, d)
+    factor_scale : ndarray of shape (k,)
+    width : int
+        Products to keep.
+    log_volume : float
+        Natural logarithm of the free space's volume [m3].
+
+    Returns
+    -------
+    parent, choice : ndarray of int64, shape (n,)
+        Hypothesis and alternative of each product, the best first.
+    score : ndarray of shape (n,)
+        Log evidence of each product.
+    """
+    size = eta.shape[1]
+    lower = np.empty((size, size))
+    solved = np.empty(size)
+    product = np.empty((size, size))
+    linear = np.empty(size)
+    # No product integrates to more than the one's integral times the other's peak.
+    own = np.empty(len(log_scale))
+    for h in range(len(log_scale)):
+        own[h] = log_integral(information[h], eta[h], log_scale[h], log_volume, lower, solved)
+    peak = np.empty(len(factor_scale))
+    for k in range(len(factor_scale)):
+        peak[k] = _log_peak(factor_information[k], factor_eta[k], factor_scale[k])
+    parent = np.empty(width, np.int64)
+    choice = np.empty(width, np.int64)
+    score = np.empty(width)
+    heap = np.empty(width, np.int64)
+    count = 0
+    for h in np.argsort(-own):
+        for k in range(len(factor_scale)):
+            if count == width and own[h] + peak[k] <= score[heap[0]]:
+                continue
+            for i in range(size):
+                linear[i] = eta[h, i] + factor_eta[k, i]
+                for j in range(i + 1):
+                    product[i, j] = information[h, i, j] + factor_information[k, i, j]
+            value = log_integral(product, linear, log_scale[h] + factor_scale[k], log_volume, lower, solved)
+            if count < width:
+                parent[count], choice[count], score[count] = h, k, value
+                # Sift up.
+                place = count
+                heap[place] = count
+                while place > 0 and score[heap[(place - 1) // 2]] > score[heap[place]]:
+                    up = (place - 1) // 2
+                    heap[up], heap[place] = heap[place], heap[up]
+                    place = up
+                count += 1
+            elif value > score[heap[0]]:
+                slot = heap[0]
+                parent[slot], choice[slot], score[slot] = h, k, value
+                _sift_down(score, heap, count)
+    order = np.argsort(-score[:count])
+    return parent[order], choice[order], score[order]
+
+
+@numba.njit(cache=True, nogil=True)
+def _log_peak(information, eta, log_scale):  # type: ignore[no-untyped-def]
+    """Logarithm of a factor's largest value; the state may be constrained in some directions only."""
+    size = len(eta)
+    lower = np.zeros((size, size))
+    solved = np.zeros(size)
+    total = log_scale
+    for j in range(size):
+        pivot = information[j, j]
+        value = eta[j]
+        for k in range(j):
+            pivot -= lower[j, k] * lower[j, k]
+            value -= lower[j, k] * solved[k]
+        if pivot <= 1e-9:
+            continue
+        root = np.sqrt(pivot)
+        lower[j, j] = root
+        solved[j] = value / root
+        total += 0.5 * solved[j] * solved[j]
+        for i in range(j + 1, size):
+            rest = information[i, j]
+            for k in range(j):
+                rest -= lower[i, k] * lower[j, k]
+            lower[i, j] = rest / root
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def climb(log_density, mean, precision, start):  # type: ignore[no-untyped-def]
+    """Climb to a mode of a Gaussian mixture in three dimensions by the fixed point of its stationarity condition.
+
+    M. A. Carreira-Perpinan, "Mode-finding for mixtures of Gaussian distributions", IEEE Trans. PAMI 22 (11), 2000:
+    at a mode ``x = (sum r_h P_h)^-1 sum r_h P_h m_h`` with the responsibilities r_h at x.
+
+    Parameters
+    ----------
+    log_density : ndarray of shape (h,)
+        Log weight plus half the log determinant of the precision.
+    mean : ndarray of shape (h, 3), m
+    precision : ndarray of shape (h, 3, 3), 1 / m2
+    start : ndarray of shape (3,), m
+
+    Returns
+    -------
+    mode : ndarray of shape (3,), m
+    curvature : ndarray of shape (3, 3), 1 / m2
+        Mean precision of the hypotheses there.
+    """
+    count = len(log_density)
+    x = start.copy()
+    logs = np.empty(count)
+    matrix = np.empty((3, 3))
+    vector = np.empty(3)
+    lower = np.empty((3, 3))
+    inverse = np.empty((3, 3))
+    for _ in range(200):
+        top = -np.inf
+        for h in range(count):
+            square = 0.0
+            for i in range(3):
+                for j in range(3):
+                    square += (x[i] - mean[h, i]) * precision[h, i, j] * (x[j] - mean[h, j])
+            logs[h] = log_density[h] - 0.5 * square
+            top = max(top, logs[h])
+        total = 0.0
+        matrix[:] = 0.0
+        vector[:] = 0.0
+        for h in range(count):
+            share = np.exp(logs[h] - top)
+            if share < 1e-12:
+                continue
+            total += share
+            for i in range(3):
+                for j in range(3):
+                    matrix[i, j] += share * precision[h, i, j]
+                    vector[i] += share * precision[h, i, j] * mean[h, j]
+        cholesky(matrix, lower)
+        invert(lower, inverse)
+        step = 0.0
+        for i in range(3):
+            value = inverse[i, 0] * vector[0] + inverse[i, 1] * vector[1] + inverse[i, 2] * vector[2]
+            step = max(step, abs(value - x[i]))
+            x[i] = value
+        matrix /= total
+        if step < 1e-5:
+            break
+    return x, matrix

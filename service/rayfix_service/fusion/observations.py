@@ -1,0 +1,199 @@
+"""Sort a report's measurements by the path they are about."""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rayfix_service.fusion.lookup import NO_DIRECTION, Direction
+from rayfix_service.fusion.report import Angle, Range, Report, TimeDifference, TimeOfArrival
+from rayfix_tables.angles import angles_of, direction, local_to_scene
+from rayfix_tables.errors import ReportError
+from rayfix_tables.site import SiteInfo, Station
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockReading:
+    """A time of arrival as a length, m: path length + offset of a clock + noise."""
+
+    clock: int
+    offset: float
+    variance: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """All that a report says of one path to one station.
+
+    Attributes
+    ----------
+    lengths : tuple of (float, float)
+        Measured path lengths [m] and their variances [m2].
+    readings : tuple of ClockReading
+    angle_index : int or None
+        Place of the angle in the report.
+    timing_indices : tuple of int
+        Places of the measurements of time in the report.
+    """
+
+    station_id: str
+    direction: Direction = NO_DIRECTION
+    lengths: tuple[tuple[float, float], ...] = ()
+    readings: tuple[ClockReading, ...] = ()
+    angle_index: int | None = None
+    timing_indices: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SortedReport:
+    """Observations, the number of unknown clocks, and what could not be used, with the reason, by place."""
+
+    observations: tuple[Observation, ...]
+    num_clocks: int
+    unused: Mapping[int, str]
+
+
+@dataclass
+class _Draft:
+    """An observation in the making."""
+
+    directions: list[tuple[int, Direction]] = field(default_factory=list)
+    lengths: list[tuple[int, float, float]] = field(default_factory=list)
+    readings: list[tuple[int, ClockReading]] = field(default_factory=list)
+
+
+def sort_report(report: Report, site: SiteInfo) -> SortedReport:
+    """Group measurements by station and path.
+
+    The k-th angle and the k-th propagation time of a station belong to one path; times of arrival and time differences
+    belong to its first path. A set of time differences with one reference is a set of times of arrival on a clock of
+    its own, of which the reference's reads zero: half of the smallest variance is then the reference's share, common
+    to all, so that their noise is correlated as it is.
+
+    Raises
+    ------
+    ReportError
+        For a station that the table does not have.
+    """
+    stations = {station.id: station for station in site.stations}
+    drafts: defaultdict[str, _Draft] = defaultdict(_Draft)
+    arrivals: list[tuple[int, str, float, float]] = []
+    differences: defaultdict[str, list[tuple[int, str, float, float]]] = defaultdict(list)
+    unused: dict[int, str] = {}
+    for index, measurement in enumerate(report.measurements):
+        station = _station(stations, measurement.station_id, index, "station_id")
+        match measurement:
+            case Angle():
+                measured = to_scene(measurement, station, site.north)
+                if in_field_of_view(station, measured):
+                    drafts[station.id].directions.append((index, measured))
+                else:
+                    unused[index] = f"the angle lies outside the field of view of station '{station.id}'"
+            case Range():
+                drafts[station.id].lengths.append((index, measurement.path_length, measurement.stdev**2))
+            case TimeOfArrival():
+                arrivals.append((index, station.id, measurement.path_length, measurement.stdev**2))
+            case TimeDifference():
+                reference = measurement.reference_station_id
+                _station(stations, reference, index, "reference_station_id")
+                differences[reference].append(
+                    (index, station.id, measurement.length_difference, measurement.stdev**2)
+                )
+    num_clocks = 0
+    if len({station_id for _, station_id, _, _ in arrivals}) > 1:
+        # Counted from their mean, the clock's offset is a mere path length, whatever the clock shows.
+        zero = float(np.mean([offset for _, _, offset, _ in arrivals]))
+        for index, station_id, offset, variance in arrivals:
+            reading = ClockReading(clock=num_clocks, offset=offset - zero, variance=variance)
+            drafts[station_id].readings.append((index, reading))
+        num_clocks += 1
+    else:
+        unused.update(
+            {i: "a time of arrival from one station only says nothing: the UE's clock is unknown" for i, *_ in arrivals}
+        )
+    for reference, rows in differences.items():
+        shared = 0.5 * min(variance for *_, variance in rows)
+        drafts[reference].readings.append((-1, ClockReading(clock=num_clocks, offset=0.0, variance=shared)))
+        for index, station_id, offset, variance in rows:
+            reading = ClockReading(clock=num_clocks, offset=offset, variance=variance - shared)
+            drafts[station_id].readings.append((index, reading))
+        num_clocks += 1
+    observations = [
+        observation for station_id, draft in drafts.items() for observation in _observations(station_id, draft)
+    ]
+    return SortedReport(observations=tuple(observations), num_clocks=num_clocks, unused=unused)
+
+
+def to_scene(angle: Angle, station: Station, north: float) -> Direction:
+    """Turn a measured angle into the scene frame, its covariance included.
+
+    Parameters
+    ----------
+    north : float, rad
+        Azimuth of geographic north in the scene frame; in the frame "north" azimuths count from there.
+    """
+    azimuth_variance = angle.azimuth_stdev**2
+    if angle.zenith is None or angle.zenith_stdev is None:
+        turn = {"scene": 0.0, "north": north, "lcs": station.orientation[0]}[angle.frame]
+        return Direction(azimuth=angle.azimuth + turn, zenith=None, cov=np.diag([azimuth_variance, np.inf]))
+    cov = np.diag([azimuth_variance, angle.zenith_stdev**2])
+    if angle.frame == "scene":
+        return Direction(azimuth=angle.azimuth, zenith=angle.zenith, cov=cov)
+    if angle.frame == "north":
+        return Direction(azimuth=angle.azimuth + north, zenith=angle.zenith, cov=cov)
+    rotation = local_to_scene(station.orientation)
+    azimuth, zenith = (float(v) for v in angles_of(rotation @ direction(angle.azimuth, angle.zenith)))
+    turned = _basis(azimuth, zenith).T @ rotation @ _basis(angle.azimuth, angle.zenith)
+    local_sine, sine = np.sin(angle.zenith), max(np.sin(zenith), 1e-9)
+    jacobian = np.diag([1.0 / sine, 1.0]) @ turned @ np.diag([local_sine, 1.0])
+    return Direction(azimuth=azimuth, zenith=zenith, cov=jacobian @ cov @ jacobian.T)
+
+
+def in_field_of_view(station: Station, measured: Direction) -> bool:
+    """Whether a direction lies within the station's cone; one without zenith always counts as inside."""
+    if station.field_of_view >= 2.0 * np.pi or measured.azimuth is None or measured.zenith is None:
+        return True
+    axis = local_to_scene(station.orientation)[:, 0]
+    cosine = float(axis @ direction(measured.azimuth, measured.zenith))
+    return bool(np.arccos(np.clip(cosine, -1.0, 1.0)) <= 0.5 * station.field_of_view)
+
+
+def _basis(azimuth: float, zenith: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Unit vectors of growing azimuth and zenith, as columns, shape (3, 2)."""
+    return np.array(
+        [
+            [-np.sin(azimuth), np.cos(zenith) * np.cos(azimuth)],
+            [np.cos(azimuth), np.cos(zenith) * np.sin(azimuth)],
+            [0.0, -np.sin(zenith)],
+        ]
+    )
+
+
+def _observations(station_id: str, draft: _Draft) -> list[Observation]:
+    count = max(len(draft.directions), len(draft.lengths), 1)
+    observations = []
+    for k in range(count):
+        angle = draft.directions[k] if k < len(draft.directions) else None
+        lengths = draft.lengths[k : k + 1]
+        readings = draft.readings if k == 0 else []
+        observations.append(
+            Observation(
+                station_id=station_id,
+                direction=angle[1] if angle else NO_DIRECTION,
+                lengths=tuple((length, variance) for _, length, variance in lengths),
+                readings=tuple(reading for _, reading in readings),
+                angle_index=angle[0] if angle else None,
+                timing_indices=tuple(i for i, *_ in [*lengths, *readings] if i >= 0),
+            )
+        )
+    return observations
+
+
+def _station(stations: Mapping[str, Station], station_id: str, index: int, name: str) -> Station:
+    if station_id not in stations:
+        known = ", ".join(list(stations)[:10]) + (", ..." if len(stations) > 10 else "")
+        raise ReportError(
+            f"station '{station_id}' is not in the table; it has {known}", path=("measurements", index, name)
+        )
+    return stations[station_id]

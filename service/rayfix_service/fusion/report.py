@@ -1,0 +1,151 @@
+"""What goes into a fix and what comes out, in SI units and radians.
+
+The JSON of the HTTP interface is another matter: :mod:`rayfix_service.wire` turns it into these and back.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Frame = Literal["scene", "lcs", "north"]
+"""Frame of an angle: the scene's, the station's local one, or the scene's turned to geographic north."""
+
+Status = Literal["ok", "ambiguous", "inconsistent", "insufficient"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Angle:
+    """An angle of arrival (AoA) at one station.
+
+    Attributes
+    ----------
+    station_id : str
+        Station that measured.
+    azimuth, zenith : float
+        Direction from the station towards the incoming ray, rad, in ``frame``; ``zenith`` is None for a sensor that
+        measures the azimuth only.
+    azimuth_stdev, zenith_stdev : float
+        Standard deviations of these two angles, rad (None as for the angle itself).
+    frame : {"scene", "lcs", "north"}
+        Frame in which the angles are given.
+    """
+
+    station_id: str
+    azimuth: float
+    azimuth_stdev: float
+    zenith: float | None = None
+    zenith_stdev: float | None = None
+    frame: Frame = "scene"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Range:
+    """A propagation time (PT) as a length: the path length from the UE to one station, m."""
+
+    station_id: str
+    path_length: float
+    stdev: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeOfArrival:
+    """A time of arrival (ToA) as a length, m: path length plus an offset common to the UE's times of arrival."""
+
+    station_id: str
+    path_length: float
+    stdev: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeDifference:
+    """A time difference of arrival (TDoA) as a length, m: t(station) - t(reference station)."""
+
+    station_id: str
+    reference_station_id: str
+    length_difference: float
+    stdev: float
+
+
+Measurement = Angle | Range | TimeOfArrival | TimeDifference
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """The measurements of one transmission."""
+
+    measurements: tuple[Measurement, ...]
+    target_id: str | None = None
+    timestamp: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """One place where the UE may be.
+
+    Attributes
+    ----------
+    probability : float
+        Posterior probability that the UE is there.
+    position : ndarray of shape (3,), m
+        Mode of the posterior density.
+    covariance : ndarray of shape (3, 3), m2
+        Second moment of the posterior about ``position``.
+    """
+
+    probability: float
+    position: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of one measurement of the report.
+
+    Attributes
+    ----------
+    used : bool
+        False for a measurement that could not contribute; ``reason`` then says why.
+    outlier_probability : float or None
+        Posterior probability that this measurement has nothing to do with the position; None when not used.
+    """
+
+    used: bool
+    outlier_probability: float | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fix:
+    """The answer to a report.
+
+    Attributes
+    ----------
+    status : {"ok", "ambiguous", "inconsistent", "insufficient"}
+        Whether the position can be trusted; docs/how-it-works.md defines each.
+    candidates : tuple of Candidate
+        Most probable first; empty when no measurement could be used.
+    outcomes : tuple of Outcome
+        One per measurement of the report, in its order.
+    log_evidence : float
+        Natural logarithm of the probability density of the report, for comparing reports.
+    """
+
+    status: Status
+    candidates: tuple[Candidate, ...]
+    outcomes: tuple[Outcome, ...]
+    log_evidence: float
+    table_id: str
+    target_id: str | None = None
+    timestamp: str | None = None
+
+    @property
+    def position(self) -> NDArray[np.float64] | None:
+        """Position of the most probable candidate, shape (3,), m."""
+        return self.candidates[0].position if self.candidates else None
+
+    @property
+    def covariance(self) -> NDArray[np.float64] | None:
+        """Covariance of the most probable candidate, shape (3, 3), m2."""
+        return self.candidates[0].covariance if self.candidates else None

@@ -1,0 +1,35 @@
+"""Settings of the fusion."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class FusionSettings:
+    """What the fusion assumes and how hard it tries.
+
+    Attributes
+    ----------
+    outlier_probability : float
+        Prior probability that a measurement has nothing to do with the position.
+    beam_width : int
+        Hypotheses that are kept from one station to the next.
+    component_floor : float
+        Components of a station whose share of its evidence is below this are left out. Since weights are
+        probabilities, so is what this can lose.
+    hypothesis_floor : float
+        Hypotheses whose share of the posterior is below this are left out of the answer.
+    ambiguous_below : float
+        A best candidate less probable than this makes the fix ``ambiguous``.
+    insufficient_above : float, m
+        A best candidate whose largest standard deviation is above this makes the fix ``insufficient``.
+    confidence : float
+        Probability that the reported ellipsoids and accuracies hold.
+    """
+
+    outlier_probability: float = 0.01
+    beam_width: int = 256
+    component_floor: float = 1e-6
+    hypothesis_floor: float = 1e-5
+    ambiguous_below: float = 0.7
+    insufficient_above: float = 3.0
+    confidence: float = 0.68

@@ -1,0 +1,103 @@
+"""Mixtures of linearised ray tubes, the content of a table's cells.
+
+A component is a Gaussian over the ray coordinates u = (path length, horizontal angle, vertical angle), the angles in
+the cell's tangent plane, and a linear Gaussian map from u to the position x::
+
+    u     ~ N(u_mean, u_cov)
+    x | u ~ N(x_mean + jacobian (u - u_mean), x_cov)
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FIELD_SHAPES: dict[str, tuple[int, ...]] = {
+    "log_weight": (),
+    "u_mean": (3,),
+    "u_cov": (6,),
+    "x_mean": (3,),
+    "jacobian": (3, 3),
+    "x_cov": (6,),
+    "num_reflections": (),
+}
+"""Shape of one component's entry in each field; symmetric matrices are packed by :func:`pack`."""
+
+FIELD_DTYPES: dict[str, type[np.generic]] = {
+    name: (np.int8 if name == "num_reflections" else np.float32) for name in FIELD_SHAPES
+}
+"""Type of each field on disk."""
+
+_UPPER = np.triu_indices(3)
+_UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+
+
+def pack(matrices: NDArray[Any]) -> NDArray[Any]:
+    """Pack symmetric matrices of shape (..., 3, 3) into their upper triangles, row by row, shape (..., 6)."""
+    return matrices[..., _UPPER[0], _UPPER[1]]
+
+
+def unpack(packed: NDArray[Any]) -> NDArray[Any]:
+    """Unpack what :func:`pack` packed."""
+    return packed[..., _UNPACK]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TubeMixture:
+    """Components of one or many cells, component axis first.
+
+    Attributes
+    ----------
+    log_weight : ndarray of shape (n,)
+        Natural logarithms; the weights of one cell sum to 1.
+    u_mean : ndarray of shape (n, 3)
+        Path length [m], horizontal and vertical tangent angle [rad].
+    u_cov : ndarray of shape (n, 6)
+        Packed covariance of u.
+    x_mean : ndarray of shape (n, 3), m
+    jacobian : ndarray of shape (n, 3, 3)
+        dx / du.
+    x_cov : ndarray of shape (n, 6), m2
+        Packed covariance of x given u.
+    num_reflections : ndarray of int8, shape (n,)
+        Reflections of the path that carries most of the component.
+    """
+
+    log_weight: NDArray[Any]
+    u_mean: NDArray[Any]
+    u_cov: NDArray[Any]
+    x_mean: NDArray[Any]
+    jacobian: NDArray[Any]
+    x_cov: NDArray[Any]
+    num_reflections: NDArray[Any]
+
+    def __len__(self) -> int:
+        """Return the number of components."""
+        return len(self.log_weight)
+
+    def __getitem__(self, index: slice) -> "TubeMixture":
+        """Components of a range, without a copy."""
+        return TubeMixture(**{name: getattr(self, name)[index] for name in FIELD_SHAPES})
+
+    @classmethod
+    def empty(cls) -> "TubeMixture":
+        """Return a mixture without components."""
+        return cls(**{name: np.zeros((0, *shape), FIELD_DTYPES[name]) for name, shape in FIELD_SHAPES.items()})
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["TubeMixture"]) -> "TubeMixture":
+        """Components of all parts, in their order."""
+        if not parts:
+            return cls.empty()
+        return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)})
+
+    def as_stored(self) -> "TubeMixture":
+        """Return the same mixture in the types of the table file."""
+        return TubeMixture(
+            **{
+                name: np.ascontiguousarray(getattr(self, name), dtype=FIELD_DTYPES[name]).reshape(-1, *shape)
+                for name, shape in FIELD_SHAPES.items()
+            }
+        )

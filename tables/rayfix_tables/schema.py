@@ -1,0 +1,79 @@
+"""Layout of a table file: names, types, and the checksum of its content. docs/table-format.md draws the whole."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
+
+FORMAT = "rayfix-table"
+FORMAT_VERSION = 1
+
+SCENE_DATASETS: dict[str, tuple[type[np.generic], int]] = {
+    "scene/vertices_m": (np.float64, 2),
+    "scene/faces": (np.int32, 2),
+    "scene/face_materials": (np.int16, 1),
+    "scene/free_space": (np.uint8, 3),
+}
+"""Type and number of axes of the scene's datasets."""
+
+LEVEL_DATASETS: dict[str, tuple[type[np.generic], int]] = {
+    "ring_cells": (np.int64, 1),
+    "cell_offsets": (np.int64, 1),
+    "cell_log_mass": (np.float64, 1),
+    **{name: (FIELD_DTYPES[name], 1 + len(shape)) for name, shape in FIELD_SHAPES.items()},
+}
+"""Type and number of axes of a level's datasets."""
+
+
+def level_path(station_id: str, level: int) -> str:
+    """Path of a level's group in the file."""
+    return f"stations/{station_id}/levels/{level}"
+
+
+def array_digest(array: NDArray[Any]) -> str:
+    """SHA-256 of an array: type, shape and bytes in C order, little-endian."""
+    array = np.ascontiguousarray(array)
+    digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
+    digest.update(array.reshape(-1).view(np.uint8).data if array.size else b"")
+    return digest.hexdigest()
+
+
+def content_id(attributes: Mapping[str, Any], digests: Mapping[str, str]) -> str:
+    """``table_id``: SHA-256 over everything that decides an answer.
+
+    Parameters
+    ----------
+    attributes : mapping
+        The attributes that :func:`content_attributes` gathers.
+    digests : mapping of dataset path to SHA-256
+    """
+    document = json.dumps([dict(attributes), dict(digests)], sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(document.encode()).hexdigest()
+
+
+def content_attributes(file: h5py.File) -> dict[str, Any]:
+    """Gather the attributes that belong to the content, by path; not the checksums, nor who wrote it when."""
+    found: dict[str, Any] = {}
+
+    def visit(name: str, node: h5py.Group | h5py.Dataset) -> None:
+        for key, value in node.attrs.items():
+            if key != "sha256":
+                found[f"{name}@{key}"] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+    file.visititems(visit)
+    for key in ("format", "format_version", "site", "scene_sha256"):
+        found[f"@{key}"] = str(file.attrs.get(key))
+    return found
+
+
+def dataset_paths(file: h5py.File) -> Iterable[str]:
+    """Paths of all datasets, sorted."""
+    paths: list[str] = []
+    file.visititems(lambda name, node: paths.append(name) if isinstance(node, h5py.Dataset) else None)
+    return sorted(paths)

@@ -1,0 +1,45 @@
+"""What a table knows of its site: stations, north, and the settings it was built with."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class Station:
+    """A base station, anchor or locator.
+
+    Attributes
+    ----------
+    position : tuple of 3 floats, m
+        In the scene frame.
+    orientation : tuple of 3 floats, rad
+        Bearing, downtilt and slant, as in 3GPP TR 38.901; they turn the scene frame into the station's local one.
+    field_of_view : float, rad
+        Full opening angle of the cone around the station's local +x axis in which it measures.
+    """
+
+    id: str
+    position: tuple[float, float, float]
+    orientation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    field_of_view: float = 6.283185307179586
+
+
+@dataclass(frozen=True, kw_only=True)
+class SiteInfo:
+    """The site as the table carries it.
+
+    Attributes
+    ----------
+    north : float, rad
+        Azimuth of geographic north in the scene frame.
+    max_path_length : float, m
+        Longest unfolded path in the table.
+    document : dict
+        The whole site file, validated, as JSON-compatible data.
+    """
+
+    name: str
+    north: float
+    max_path_length: float
+    stations: tuple[Station, ...]
+    document: dict[str, Any] = field(default_factory=dict)

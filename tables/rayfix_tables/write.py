@@ -1,0 +1,213 @@
+"""Write table files: beside the final name, checksummed, synced, then renamed into place."""
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_tables.errors import TableError
+from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.grid import AngularGrid
+from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+from rayfix_tables.schema import (
+    FORMAT,
+    FORMAT_VERSION,
+    array_digest,
+    content_attributes,
+    content_id,
+    dataset_paths,
+    level_path,
+)
+from rayfix_tables.site import SiteInfo
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelContent:
+    """All cells of one station at one window.
+
+    Attributes
+    ----------
+    window : float, rad
+        Standard deviation of the cells' Gaussian window, along either tangent axis.
+    cell_offsets : ndarray of int64, shape (n_cells + 1,)
+        Components of cell ``c`` are those from ``cell_offsets[c]`` to ``cell_offsets[c + 1]``.
+    cell_log_mass : ndarray of shape (n_cells,)
+        Natural logarithm of the integral of the cell's measure; -inf for a cell without components.
+    mixture : TubeMixture
+        Components of all cells.
+    """
+
+    window: float
+    grid: AngularGrid
+    cell_offsets: NDArray[np.int64]
+    cell_log_mass: NDArray[np.float64]
+    mixture: TubeMixture
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of the level's arrays in the file."""
+        arrays = [getattr(self.mixture, name) for name in FIELD_SHAPES]
+        return sum(a.nbytes for a in (self.grid.ring_cells, self.cell_offsets, self.cell_log_mass, *arrays))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationContent:
+    """A station's part of the table.
+
+    Attributes
+    ----------
+    lost_ray_share : float
+        Share of the launched rays that left the scene without having come to their last reflection.
+    coverage : tuple of float
+        Share of the free space that is reached with at most 0, 1, 2, ... reflections.
+    """
+
+    levels: tuple[LevelContent, ...]
+    lost_ray_share: float
+    coverage: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneContent:
+    """The scene's part of the table.
+
+    Attributes
+    ----------
+    vertices : ndarray of shape (n_vertices, 3), m
+    faces : ndarray of int, shape (n_faces, 3)
+    face_materials : ndarray of int, shape (n_faces,)
+        Index into ``materials``; -1 for none.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    face_materials: NDArray[np.int16]
+    materials: tuple[str, ...]
+    free_space: FreeSpace
+    sha256: str
+
+
+def check_writable(path: Path) -> None:
+    """Fail before the work is done rather than after.
+
+    Raises
+    ------
+    TableError
+        When a table cannot be written under this name.
+    """
+    if path.is_dir():
+        raise TableError(f"cannot write {path}: it is a folder; give a file name such as {path / 'table.h5'}")
+    if not path.parent.is_dir():
+        raise TableError(f"cannot write {path}: there is no folder {path.parent}; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise TableError(f"cannot write {path}: the folder {path.parent} is read-only; choose another")
+
+
+def write_table(
+    path: Path,
+    *,
+    site: SiteInfo,
+    scene: SceneContent,
+    stations: Sequence[StationContent],
+    software_version: str,
+) -> str:
+    """Write a table file and return its ``table_id``.
+
+    Nothing appears under ``path`` until the whole table is on disk; whatever was there before stays until then.
+
+    Parameters
+    ----------
+    stations : sequence of StationContent
+        In the order of ``site.stations``.
+
+    Raises
+    ------
+    TableError
+        When the disk is full or the folder cannot be written; no partial file is left.
+    """
+    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
+    try:
+        with h5py.File(partial, "w", alignment_threshold=1, alignment_interval=64) as file:
+            _write_scene(file, scene)
+            for station, content in zip(site.stations, stations, strict=True):
+                group = file.create_group(f"stations/{station.id}")
+                group.attrs["position_m"] = np.asarray(station.position)
+                group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
+                group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
+                group.attrs["lost_ray_share"] = content.lost_ray_share
+                group.attrs["coverage"] = np.asarray(content.coverage)
+                for n, level in enumerate(content.levels):
+                    _write_level(file.create_group(level_path(station.id, n)), level)
+            file.attrs["format"] = FORMAT
+            file.attrs["format_version"] = FORMAT_VERSION
+            file.attrs["software_version"] = software_version
+            file.attrs["scene_sha256"] = scene.sha256
+            file.attrs["site"] = json.dumps(_site_document(site), sort_keys=True)
+            digests = {name: str(file[name].attrs["sha256"]) for name in dataset_paths(file)}
+            table_id = content_id(content_attributes(file), digests)
+            file.attrs["table_id"] = table_id
+        with partial.open("rb") as handle:
+            os.fsync(handle.fileno())
+        partial.replace(path)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    except (OSError, RuntimeError) as error:
+        raise TableError(
+            f"cannot write {path}: {_first_line(error)}; free some space or choose another folder"
+        ) from error
+    finally:
+        partial.unlink(missing_ok=True)
+    return table_id
+
+
+def _write_scene(file: h5py.File, scene: SceneContent) -> None:
+    group = file.create_group("scene")
+    group.attrs["materials"] = json.dumps(scene.materials)
+    _write(group, "vertices_m", scene.vertices.astype(np.float64))
+    _write(group, "faces", scene.faces.astype(np.int32))
+    _write(group, "face_materials", scene.face_materials.astype(np.int16))
+    free_space = _write(group, "free_space", scene.free_space.free.astype(np.uint8))
+    free_space.attrs["origin_m"] = scene.free_space.origin
+    free_space.attrs["voxel_size_m"] = scene.free_space.voxel_size
+
+
+def _write_level(group: h5py.Group, level: LevelContent) -> None:
+    group.attrs["window_deg"] = float(np.rad2deg(level.window))
+    _write(group, "ring_cells", level.grid.ring_cells.astype(np.int64))
+    _write(group, "cell_offsets", level.cell_offsets.astype(np.int64))
+    _write(group, "cell_log_mass", level.cell_log_mass.astype(np.float64))
+    stored = level.mixture.as_stored()
+    for name in FIELD_SHAPES:
+        _write(group, name, getattr(stored, name))
+
+
+def _write(group: h5py.Group, name: str, array: NDArray[Any]) -> h5py.Dataset:
+    dataset = group.create_dataset(name, data=array)
+    dataset.attrs["sha256"] = array_digest(array)
+    return dataset
+
+
+def _site_document(site: SiteInfo) -> dict[str, Any]:
+    return {
+        "name": site.name,
+        "north_deg": float(np.rad2deg(site.north)),
+        "max_path_length_m": site.max_path_length,
+        "station_ids": [station.id for station in site.stations],
+        "document": site.document,
+    }
+
+
+def _first_line(error: BaseException) -> str:
+    """Say in one line what HDF5 says in several."""
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno)
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
