@@ -1,0 +1,33 @@
+"""rayfix: indoor position fixes from angles and times of arrival, fused with a digital twin.
+
+>>> import rayfix
+>>> table = rayfix.build("site.toml")                # or rayfix.Table.open("site.h5")
+>>> fix = rayfix.Locator(table).locate(report)       # a rayfix.Report or a dict of the HTTP interface's JSON
+
+The offline half needs the extra ``rayfix[offline]``, the fusion ``rayfix[service]``; reading tables needs neither.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from rayfix_tables.errors import RayfixError
+from rayfix_tables.table import Table
+from rayfix_tables.version import software_version
+
+if TYPE_CHECKING:
+    from rayfix.api import Locator as Locator
+    from rayfix.api import build as build
+    from rayfix_service.fusion.report import Fix as Fix
+    from rayfix_service.fusion.report import Report as Report
+
+__version__ = software_version()
+
+__all__ = ["Fix", "Locator", "RayfixError", "Report", "Table", "__version__", "build"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what needs an extra when it is first asked for."""
+    if name not in __all__:
+        raise AttributeError(f"module 'rayfix' has no attribute '{name}'")
+    from rayfix import api
+
+    return getattr(api, name)

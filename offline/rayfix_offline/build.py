@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.em import ExpectationMaximisation, fit_em
 from rayfix_offline.site import SiteFile, read_site
-from rayfix_offline.trace import LevelRays, trace_station
+from rayfix_offline.trace import LevelRays, level_grid, trace_station
 from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_offline.twin import Twin, prepare_twin, refuse_errors
 from rayfix_tables.angles import direction, local_to_scene
@@ -27,8 +27,11 @@ BLOCK_CELLS = 256
 LOST_RAYS_WARNING = 0.01
 """In a closed scene, more lost rays than this share mean that it has holes."""
 
+FittedCells = tuple[NDArray[np.int64], NDArray[np.float64], TubeMixture]
+"""Components of each cell, log mass of each cell, components of all cells."""
+
 Progress = Callable[[str, int, int], None]
-"""Called with the stage, the cells that are done and the cells that there are."""
+"""Called with the stage, the cells that are done and the cells that there are in all (0 while not yet known)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,31 +85,45 @@ def build_table(
     site_path, table_path = Path(site_path), Path(table_path)
     site = read_site(site_path)
     check_writable(table_path)
-    report("reading the scene", 0, 1)
+    report("reading the scene", 0, 0)
     twin = prepare_twin(site, site_path.parent)
     refuse_errors(twin)
     info = site.info()
     warnings = [finding.message for finding in twin.findings]
+    views = [_cells_in_view(station, site) for station in info.stations]
+    total = sum(len(cells) for view in views for cells in view)
+    done = 0
     contents: list[StationContent] = []
-    for number, (section, station) in enumerate(zip(site.stations, info.stations, strict=True)):
-        report(f"{station.id}: tracing", number, len(site.stations))
+    for section, station, view in zip(site.stations, info.stations, views, strict=True):
+        report(f"{station.id}: tracing rays", done, total)
         trace = trace_station(section, site, twin)
         if twin.closed and trace.lost_ray_share > LOST_RAYS_WARNING:
             warnings.append(
                 f"{trace.lost_ray_share:.1%} of the rays of station '{station.id}' leave the closed scene; it has "
                 "holes: close them"
             )
-        levels = tuple(_build_level(level, station, site, jobs, report) for level in trace.levels)
+        levels = []
+        for level, cells in zip(trace.levels, view, strict=True):
+            stage = f"{station.id}: {np.rad2deg(level.window):g} deg cells"
+            parts = []
+            for block, fitted in _fit_blocks(cells, level, site, jobs):
+                parts.append((block, fitted))
+                done += len(block)
+                report(stage, done, total)
+            levels.append(_level_content(level, parts))
         contents.append(
-            StationContent(levels=levels, lost_ray_share=trace.lost_ray_share, coverage=trace.coverage)
+            StationContent(levels=tuple(levels), lost_ray_share=trace.lost_ray_share, coverage=trace.coverage)
         )
     if not any(len(level.mixture) for content in contents for level in content.levels):
         raise BuildError("no ray of any station finds free space; check the stations' positions and fields of view")
-    report("writing", 0, 1)
+    report("writing", done, total)
     table_id = write_table(
-        table_path, site=info, scene=_scene_content(twin), stations=contents, software_version=software_version()
+        table_path,
+        site=info,
+        scene=_scene_content(twin),
+        stations=contents,
+        software_version=software_version(),
     )
-    report("writing", 1, 1)
     return BuildSummary(
         path=table_path,
         table_id=table_id,
@@ -117,48 +134,48 @@ def build_table(
     )
 
 
-def _build_level(level: LevelRays, station: Station, site: SiteFile, jobs: int, report: Progress) -> LevelContent:
-    chosen = np.flatnonzero(_in_view(level.grid.centres, station, margin=level.window))
-    blocks = np.split(chosen, np.arange(BLOCK_CELLS, len(chosen), BLOCK_CELLS))
+def _cells_in_view(station: Station, site: SiteFile) -> list[NDArray[np.int64]]:
+    """Cells of each level whose centre lies in the station's field of view or hardly outside."""
+    axis = local_to_scene(station.orientation)[:, 0]
+    found = []
+    for window in np.deg2rad(site.table.windows_deg):
+        centres = level_grid(float(window)).centres
+        angle = np.arccos(np.clip(direction(centres[:, 0], centres[:, 1]) @ axis, -1.0, 1.0))
+        found.append(np.flatnonzero(angle <= 0.5 * station.field_of_view + window))
+    return found
+
+
+def _fit_blocks(
+    cells: NDArray[np.int64], level: LevelRays, site: SiteFile, jobs: int
+) -> Iterator[tuple[NDArray[np.int64], FittedCells]]:
+    """Fit the cells of a level in parallel, block by block, in their order."""
+    blocks = [cells[i : i + BLOCK_CELLS] for i in range(0, len(cells), BLOCK_CELLS)]
+    centres = level.grid.centres
+    if site.table.fit == "em":
+        # scikit-learn holds the interpreter's lock, so its fits need processes.
+        settings = ExpectationMaximisation(seed=site.table.seed)
+        tasks = (delayed(fit_em)(centres[b], b, level, settings) for b in blocks)
+        results = Parallel(n_jobs=jobs, return_as="generator")(tasks)
+    else:
+        # The compiled kernels release the lock, so threads share the rays without a copy.
+        tasks = (delayed(fit_tubes)(centres[b], level, TubeFit()) for b in blocks)
+        results = Parallel(n_jobs=jobs, prefer="threads", return_as="generator")(tasks)
+    yield from zip(blocks, results, strict=True)
+
+
+def _level_content(level: LevelRays, parts: list[tuple[NDArray[np.int64], FittedCells]]) -> LevelContent:
+    """Put fitted blocks of cells together."""
     counts = np.zeros(level.grid.num_cells, np.int64)
     log_mass = np.full(level.grid.num_cells, -np.inf)
-    parts: list[TubeMixture] = []
-    stage = f"{station.id}: {np.rad2deg(level.window):g} deg cells"
-    done = 0
-    report(stage, done, len(chosen))
-    for block, (block_counts, block_mass, mixture) in zip(blocks, _fit_blocks(blocks, level, site, jobs), strict=True):
+    for block, (block_counts, block_mass, _) in parts:
         counts[block], log_mass[block] = block_counts, block_mass
-        parts.append(mixture)
-        done += len(block)
-        report(stage, done, len(chosen))
     return LevelContent(
         window=level.window,
         grid=level.grid,
         cell_offsets=np.concatenate([[0], np.cumsum(counts)]),
         cell_log_mass=log_mass,
-        mixture=TubeMixture.concatenate(parts),
+        mixture=TubeMixture.concatenate([mixture for _, (_, _, mixture) in parts]),
     )
-
-
-def _fit_blocks(
-    blocks: list[NDArray[np.int64]], level: LevelRays, site: SiteFile, jobs: int
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], TubeMixture]]:
-    centres = level.grid.centres
-    if site.table.fit == "em":
-        # scikit-learn holds the interpreter's lock, so its fits need processes.
-        tasks = (delayed(fit_em)(centres[b], b, level, ExpectationMaximisation(seed=site.table.seed)) for b in blocks)
-        yield from Parallel(n_jobs=jobs, return_as="generator")(tasks)
-    else:
-        # The compiled kernels release the lock, so threads share the rays without a copy.
-        tasks = (delayed(fit_tubes)(centres[b], level, TubeFit()) for b in blocks)
-        yield from Parallel(n_jobs=jobs, prefer="threads", return_as="generator")(tasks)
-
-
-def _in_view(centres: NDArray[np.float64], station: Station, *, margin: float) -> NDArray[np.bool_]:
-    """Cells whose centre lies in the station's field of view or hardly outside."""
-    axis = local_to_scene(station.orientation)[:, 0]
-    angle = np.arccos(np.clip(direction(centres[:, 0], centres[:, 1]) @ axis, -1.0, 1.0))
-    return np.asarray(angle <= 0.5 * station.field_of_view + margin)
 
 
 def _scene_content(twin: Twin) -> SceneContent:

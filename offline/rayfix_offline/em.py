@@ -140,5 +140,8 @@ def _fit_points(
         np.int8,
     )
     return joint_to_tubes(
-        np.log(np.maximum(chosen.weights_, 1e-12)), chosen.means_ * scale + points.mean(axis=0), cov, reflections
+        np.log(np.maximum(chosen.weights_, 1e-12)),
+        chosen.means_ * scale + points.mean(axis=0),
+        cov,
+        reflections,
     )

@@ -40,6 +40,7 @@ class EmbreeEngine:
         if not len(origins):
             return np.zeros(0, np.int32)
         hits = self._scene.run(
-            np.ascontiguousarray(origins, dtype=np.float32), np.ascontiguousarray(directions, dtype=np.float32)
+            np.ascontiguousarray(origins, dtype=np.float32),
+            np.ascontiguousarray(directions, dtype=np.float32),
         )
         return np.asarray(hits, dtype=np.int32)

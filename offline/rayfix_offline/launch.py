@@ -108,7 +108,7 @@ def thin(rays: RaySet, spacing: float) -> tuple[RaySet, NDArray[np.int64]]:
     Parameters
     ----------
     spacing : float, rad
-        At least twice that of ``rays``, so that no cell is empty.
+        At least twice that of ``rays``.
 
     Returns
     -------
@@ -117,13 +117,17 @@ def thin(rays: RaySet, spacing: float) -> tuple[RaySet, NDArray[np.int64]]:
         Places of the chosen rays in the finer set.
     """
     grid = AngularGrid.from_spacing(spacing)
+    if rays.grid.num_rings < 2 * grid.num_rings - 1:
+        raise ValueError(f"rays {spacing} rad apart cannot be chosen from a set that is hardly finer")
     cell = grid.nearest(rays.azimuth, rays.zenith)
     # The rays are stratified already; the middle one of a cell is as good a draw as any.
     order = np.argsort(cell, kind="stable")
-    found, first, count = np.unique(cell[order], return_index=True, return_counts=True)
-    if len(found) != grid.num_cells:
-        raise ValueError(f"rays {spacing} rad apart cannot be chosen from a set that is hardly finer")
-    index = order[first + count // 2]
+    count = np.bincount(cell, minlength=grid.num_cells)
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    index = order[np.minimum(first + count // 2, len(order) - 1)]
+    # At twice the spacing a few cells hold no whole finer cell, and may be empty: the ray at their centre is as near.
+    empty = np.flatnonzero(count == 0)
+    index[empty] = rays.grid.nearest(grid.centres[empty, 0], grid.centres[empty, 1])
     ring = np.repeat(np.arange(grid.num_rings), grid.ring_cells)
     chosen = RaySet(
         grid=grid, azimuth=rays.azimuth[index], zenith=rays.zenith[index], solid_angle=grid.solid_angles[ring]
@@ -226,4 +230,4 @@ def _exit_length(
     """Length at which rays leave the scene's bounding box, shape (n_rays,), m."""
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = (np.where(heading > 0, bounds[1], bounds[0]) - image) / heading
-    return np.where(np.isfinite(reach), reach, np.inf).min(axis=1, initial=np.inf)
+    return np.asarray(np.where(np.isfinite(reach), reach, np.inf).min(axis=1, initial=np.inf))

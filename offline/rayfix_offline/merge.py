@@ -5,12 +5,17 @@ A. R. Runnalls, "Kullback-Leibler approach to Gaussian mixture reduction", IEEE 
 at most ``B(i, j) = ((w_i + w_j) log|P_ij| - w_i log|P_i| - w_j log|P_j|) / 2``.
 """
 
+from typing import Any
+
 import numba
 import numpy as np
 
 
 @numba.njit(cache=True, nogil=True)
-def log_det(matrix, scratch):  # type: ignore[no-untyped-def]
+def log_det(
+    matrix: Any,
+    scratch: Any,
+) -> Any:
     """Logarithm of the determinant of a positive definite matrix, by Cholesky; ``scratch`` has its shape."""
     size = len(matrix)
     total = 0.0
@@ -31,7 +36,15 @@ def log_det(matrix, scratch):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def merged_cov(wa, mean_a, cov_a, wb, mean_b, cov_b, out):  # type: ignore[no-untyped-def]
+def merged_cov(
+    wa: Any,
+    mean_a: Any,
+    cov_a: Any,
+    wb: Any,
+    mean_b: Any,
+    cov_b: Any,
+    out: Any,
+) -> None:
     """Covariance of the union of two weighted Gaussians, into ``out``."""
     share_a = wa / (wa + wb)
     share_b = 1.0 - share_a
@@ -45,7 +58,19 @@ def merged_cov(wa, mean_a, cov_a, wb, mean_b, cov_b, out):  # type: ignore[no-un
 
 
 @numba.njit(cache=True, nogil=True)
-def _best_partner(i, count, alive, weight, mean, cov, logdet, best, cost, union, scratch):  # type: ignore[no-untyped-def]
+def _best_partner(
+    i: Any,
+    count: Any,
+    alive: Any,
+    weight: Any,
+    mean: Any,
+    cov: Any,
+    logdet: Any,
+    best: Any,
+    cost: Any,
+    union: Any,
+    scratch: Any,
+) -> None:
     best[i] = -1
     cost[i] = np.inf
     for j in range(i + 1, count):
@@ -59,7 +84,14 @@ def _best_partner(i, count, alive, weight, mean, cov, logdet, best, cost, union,
 
 
 @numba.njit(cache=True, nogil=True)
-def merge_runnalls(weight, mean, cov, label, max_components, max_divergence):  # type: ignore[no-untyped-def]
+def merge_runnalls(
+    weight: Any,
+    mean: Any,
+    cov: Any,
+    label: Any,
+    max_components: Any,
+    max_divergence: Any,
+) -> Any:
     """Merge components, in place, until the next merge would cost too much.
 
     Parameters
@@ -94,7 +126,7 @@ def merge_runnalls(weight, mean, cov, label, max_components, max_divergence):  #
         _best_partner(i, count, alive, weight, mean, cov, logdet, best, cost, union, scratch)
     left = count
     while left > 1:
-        i = np.argmin(cost)
+        i = int(np.argmin(cost))
         if left <= max_components and cost[i] > max_divergence:
             break
         j = best[i]

@@ -4,6 +4,8 @@ The joint vector is (path length, horizontal angle, vertical angle, x, y, z); th
 cell. Moments are taken about the group's own reference point, so that nothing large cancels.
 """
 
+from typing import Any
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -27,26 +29,26 @@ _KEY_STRIDE = 4096
 
 @numba.njit(cache=True, nogil=True)
 def gather_groups(
-    centre_azimuth,
-    centre_zenith,
-    window,
-    ring_offsets,
-    ring_cells,
-    azimuth,
-    zenith,
-    solid_angle,
-    directions,
-    piece_offsets,
-    piece_sequence,
-    piece_slice,
-    piece_mass,
-    piece_mean,
-    piece_variance,
-    images,
-    mirrors,
-    log_ratio,
-    slots,
-):  # type: ignore[no-untyped-def]
+    centre_azimuth: Any,
+    centre_zenith: Any,
+    window: Any,
+    ring_offsets: Any,
+    ring_cells: Any,
+    azimuth: Any,
+    zenith: Any,
+    solid_angle: Any,
+    directions: Any,
+    piece_offsets: Any,
+    piece_sequence: Any,
+    piece_slice: Any,
+    piece_mass: Any,
+    piece_mean: Any,
+    piece_variance: Any,
+    images: Any,
+    mirrors: Any,
+    log_ratio: Any,
+    slots: Any,
+) -> Any:
     """Add up the weighted moments of one cell.
 
     Parameters
@@ -182,7 +184,14 @@ def gather_groups(
 
 
 @numba.njit(cache=True, nogil=True)
-def blur(mean, cov, mirror, centre_azimuth, centre_zenith, ray_spacing):  # type: ignore[no-untyped-def]
+def blur(
+    mean: Any,
+    cov: Any,
+    mirror: Any,
+    centre_azimuth: Any,
+    centre_zenith: Any,
+    ray_spacing: Any,
+) -> None:
     """Give a group the width of its rays: each stands for a patch of directions, and nothing is exact to a millimetre.
 
     Parameters
@@ -207,7 +216,11 @@ def blur(mean, cov, mirror, centre_azimuth, centre_zenith, ray_spacing):  # type
     local[0, 2] = np.cos(zenith) * np.cos(azimuth) * mean[0]
     local[1, 2] = np.cos(zenith) * np.sin(azimuth) * mean[0]
     local[2, 2] = -np.sin(zenith) * mean[0]
-    variances = (LENGTH_FLOOR * LENGTH_FLOOR, ray_spacing * ray_spacing / 12.0, ray_spacing * ray_spacing / 12.0)
+    variances = (
+        LENGTH_FLOOR * LENGTH_FLOOR,
+        ray_spacing * ray_spacing / 12.0,
+        ray_spacing * ray_spacing / 12.0,
+    )
     for k in range(3):
         for i in range(3):
             step_i = 0.0
@@ -226,7 +239,10 @@ def blur(mean, cov, mirror, centre_azimuth, centre_zenith, ray_spacing):  # type
 
 
 @numba.njit(cache=True, nogil=True)
-def _grown(array, capacity):  # type: ignore[no-untyped-def]
+def _grown(
+    array: Any,
+    capacity: Any,
+) -> Any:
     larger = np.zeros((capacity, *array.shape[1:]), array.dtype)
     larger[: len(array)] = array
     return larger

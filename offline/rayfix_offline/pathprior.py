@@ -6,6 +6,7 @@ stands for the solid angle dOmega fills ``s^2 dOmega ds`` of space between the l
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -100,8 +101,20 @@ def fill_path_prior(
 
 @numba.njit(cache=True, nogil=True)
 def _fill(
-    sequence, start, end, images, mirrors, directions, solid_angle, factors, exponent, origin, voxel, power, reached
-):  # type: ignore[no-untyped-def]
+    sequence: Any,
+    start: Any,
+    end: Any,
+    images: Any,
+    mirrors: Any,
+    directions: Any,
+    solid_angle: Any,
+    factors: Any,
+    exponent: Any,
+    origin: Any,
+    voxel: Any,
+    power: Any,
+    reached: Any,
+) -> None:
     nx, ny, nz = power.shape
     heading = np.empty(3)
     for ray in range(sequence.shape[0]):

@@ -8,7 +8,7 @@ A piece is shared by all cells of all levels whose window the ray lies in.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numba
 import numpy as np
@@ -116,13 +116,21 @@ def cut_pieces(
 
 
 @numba.njit(cache=True, nogil=True)
-def _node(length, log_ratio):  # type: ignore[no-untyped-def]
+def _node(
+    length: Any,
+    log_ratio: Any,
+) -> Any:
     """Slice coordinate of a length: n at node n, between the nodes linear in the logarithm."""
     return max(0.0, np.log(max(length, FIRST_NODE) / FIRST_NODE) / log_ratio)
 
 
 @numba.njit(cache=True, nogil=True)
-def _count(sequence, start, end, log_ratio):  # type: ignore[no-untyped-def]
+def _count(
+    sequence: Any,
+    start: Any,
+    end: Any,
+    log_ratio: Any,
+) -> Any:
     counts = np.zeros(sequence.shape[0], np.int64)
     for ray in range(sequence.shape[0]):
         for depth in range(sequence.shape[1]):
@@ -136,27 +144,27 @@ def _count(sequence, start, end, log_ratio):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _cut(
-    sequence,
-    start,
-    end,
-    images,
-    mirrors,
-    directions,
-    factors,
-    exponent,
-    origin,
-    voxel,
-    total,
-    kind,
-    log_ratio,
-    step,
-    offsets,
-    out_sequence,
-    out_slice,
-    out_mass,
-    out_mean,
-    out_variance,
-):  # type: ignore[no-untyped-def]
+    sequence: Any,
+    start: Any,
+    end: Any,
+    images: Any,
+    mirrors: Any,
+    directions: Any,
+    factors: Any,
+    exponent: Any,
+    origin: Any,
+    voxel: Any,
+    total: Any,
+    kind: Any,
+    log_ratio: Any,
+    step: Any,
+    offsets: Any,
+    out_sequence: Any,
+    out_slice: Any,
+    out_mass: Any,
+    out_mean: Any,
+    out_variance: Any,
+) -> None:
     nx, ny, nz = total.shape
     heading = np.empty(3)
     for ray in range(sequence.shape[0]):

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from trimesh.units import unit_conversion
 
 from rayfix_tables.errors import SceneError
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 FILE_TYPES = ("glb", "gltf", "obj", "ply", "stl", "dae")
 
-_TRIMESH_UNITS = {"meters": 1.0, "m": 1.0, "centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "feet": 0.3048}
 _MIN_AREA = 1e-12
 
 
@@ -98,7 +98,8 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
             meshes.append((str(node), geometry, transform))
     if not meshes:
         raise SceneError(f"{path} holds no triangles; export the scene as a triangle mesh")
-    scale = _TRIMESH_UNITS.get(str(loaded.units), METRES_PER_UNIT[unit]) if kind == "dae" else METRES_PER_UNIT[unit]
+    # trimesh reads the unit of a COLLADA file (as "0.01 * meters"), but does not apply it.
+    scale = float(unit_conversion(loaded.units, "meters")) if kind == "dae" else METRES_PER_UNIT[unit]
     scene = _gather(meshes, scale=scale, up=up)
     if not np.all(np.isfinite(scene.vertices)):
         raise SceneError(f"{path} has coordinates that are not finite; export the scene again")

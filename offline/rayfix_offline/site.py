@@ -43,7 +43,11 @@ class PropagationSection(_Section):
 class TableSection(_Section):
     """``[table]``: how finely the table is cut."""
 
-    windows_deg: Annotated[tuple[Annotated[float, Field(ge=0.1, le=30)], ...], Field(min_length=1)] = (1.25, 5.0, 15.0)
+    windows_deg: Annotated[tuple[Annotated[float, Field(ge=0.1, le=30)], ...], Field(min_length=1)] = (
+        1.25,
+        5.0,
+        15.0,
+    )
     fit: Literal["tubes", "em"] = "tubes"
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
 
@@ -154,7 +158,7 @@ def _problem(error: Any) -> str:
 
 def _known_keys(location: tuple[str | int, ...]) -> list[str]:
     model: type[BaseModel] = SiteFile
-    sections = {
+    sections: dict[str, type[BaseModel]] = {
         "site": SiteSection,
         "propagation": PropagationSection,
         "table": TableSection,

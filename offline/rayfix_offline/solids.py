@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -159,7 +160,12 @@ def map_free_space(
 
 
 @numba.njit(cache=True, nogil=True)
-def _flip_above(triangles, origin, voxel, parity):  # type: ignore[no-untyped-def]
+def _flip_above(
+    triangles: Any,
+    origin: Any,
+    voxel: Any,
+    parity: Any,
+) -> None:
     """Flip the voxels whose centres lie above each triangle: at the end those inside are set."""
     nx, ny, nz = parity.shape
     # Columns a hair off the voxels' centres, so that they meet no edge of a drawing on round coordinates.

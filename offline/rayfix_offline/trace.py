@@ -67,6 +67,11 @@ class StationTrace:
     coverage: tuple[float, ...]
 
 
+def level_grid(window: float) -> AngularGrid:
+    """Grid of the cells of a window [rad]."""
+    return AngularGrid.from_spacing(window / CELLS_PER_WINDOW)
+
+
 def trace_station(station: StationSection, site: SiteFile, twin: Twin) -> StationTrace:
     """Launch a station's rays and cut them into pieces.
 
@@ -106,7 +111,7 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin) -> Statio
         levels.append(
             LevelRays(
                 window=window,
-                grid=AngularGrid.from_spacing(window / CELLS_PER_WINDOW),
+                grid=level_grid(window),
                 rays=level_rays,
                 ray_spacing=level_spacing,
                 pieces=level_pieces,

@@ -1,6 +1,7 @@
 """``fit = "tubes"``: cells fitted by analytic moments of their ray pieces, then merged."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -111,30 +112,30 @@ def joint_to_tubes(
 
 @numba.njit(cache=True, nogil=True)
 def _fit_block(
-    centres,
-    window,
-    ring_offsets,
-    ring_cells,
-    azimuth,
-    zenith,
-    solid_angle,
-    directions,
-    piece_offsets,
-    piece_sequence,
-    piece_slice,
-    piece_mass,
-    piece_mean,
-    piece_variance,
-    images,
-    mirrors,
-    log_ratio,
-    ray_spacing,
-    dropped_mass,
-    max_groups,
-    max_components,
-    max_divergence,
-    slots,
-):  # type: ignore[no-untyped-def]
+    centres: Any,
+    window: Any,
+    ring_offsets: Any,
+    ring_cells: Any,
+    azimuth: Any,
+    zenith: Any,
+    solid_angle: Any,
+    directions: Any,
+    piece_offsets: Any,
+    piece_sequence: Any,
+    piece_slice: Any,
+    piece_mass: Any,
+    piece_mean: Any,
+    piece_variance: Any,
+    images: Any,
+    mirrors: Any,
+    log_ratio: Any,
+    ray_spacing: Any,
+    dropped_mass: Any,
+    max_groups: Any,
+    max_components: Any,
+    max_divergence: Any,
+    slots: Any,
+) -> Any:
     num_cells = len(centres)
     counts = np.zeros(num_cells, np.int64)
     log_mass = np.full(num_cells, -np.inf)
@@ -180,7 +181,14 @@ def _fit_block(
         part_cov = group_cov[chosen]
         part_label = seq[chosen]
         for i in range(kept):
-            blur(part_mean[i], part_cov[i], mirrors[part_label[i]], centres[cell, 0], centres[cell, 1], ray_spacing)
+            blur(
+                part_mean[i],
+                part_cov[i],
+                mirrors[part_label[i]],
+                centres[cell, 0],
+                centres[cell, 1],
+                ray_spacing,
+            )
         alive = merge_runnalls(weight, part_mean, part_cov, part_label, max_components, max_divergence)
         log_mass[cell] = np.log(whole)
         for i in range(kept):

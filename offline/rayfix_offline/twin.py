@@ -68,7 +68,10 @@ def prepare_twin(site: SiteFile, folder: Path) -> Twin:
     stations = np.array([station.position_m for station in site.stations])
     enclosing, inside = find_enclosures(scene, parts, stations)
     free_space = map_free_space(scene, parts, enclosing, voxel_size=VOXEL_SIZE)
-    findings = [*_scene_findings(site, scene, parts, enclosing), *_station_findings(site, scene, parts, enclosing, inside)]
+    findings = [
+        *_scene_findings(site, scene, parts, enclosing),
+        *_station_findings(site, scene, parts, enclosing, inside),
+    ]
     if not free_space.free.any():
         message = "the scene has no free space: every voxel lies in a solid or outside; check for an inverted room"
         findings.append(Finding(severity="error", message=message))
@@ -102,11 +105,11 @@ def _scene_findings(
     extent = scene.bounds[1] - scene.bounds[0]
     size = " x ".join(f"{length:,.6g}" for length in extent)
     if extent.max() > LARGE_SCENE:
-        messages.append(f"the scene is {size} m large; if its coordinates are millimetres, set scene_unit = \"mm\"")
+        messages.append(f'the scene is {size} m large; if its coordinates are millimetres, set scene_unit = "mm"')
     elif extent.max() < SMALL_SCENE:
         messages.append(f"the scene is only {size} m large; set scene_unit to the unit of its coordinates")
     if extent[2] > 2.0 * extent[:2].min() and site.site.scene_up == "z":
-        messages.append(f"the scene is {size} m large and seems to lie on its side; if y points up, set scene_up = \"y\"")
+        messages.append(f'the scene is {size} m large and seems to lie on its side; if y points up, set scene_up = "y"')
     if scene.num_degenerate:
         messages.append(f"{scene.num_degenerate} triangles have no area and are left out; clean the mesh")
     open_names = _names([part for part in parts if not part.closed])
@@ -131,7 +134,11 @@ def _scene_findings(
 
 
 def _station_findings(
-    site: SiteFile, scene: Scene, parts: tuple[Part, ...], enclosing: NDArray[np.bool_], inside: NDArray[np.bool_]
+    site: SiteFile,
+    scene: Scene,
+    parts: tuple[Part, ...],
+    enclosing: NDArray[np.bool_],
+    inside: NDArray[np.bool_],
 ) -> list[Finding]:
     messages = []
     low, high = scene.bounds
@@ -144,7 +151,9 @@ def _station_findings(
             continue
         for p, part in enumerate(parts):
             if part.closed and inside[p, s] != enclosing[p]:
-                where = f"inside the solid '{part.name}'" if inside[p, s] else f"outside or in the wall of '{part.name}'"
+                where = (
+                    f"inside the solid '{part.name}'" if inside[p, s] else f"outside or in the wall of '{part.name}'"
+                )
                 messages.append(f"{place} lies {where}; move it into free space")
                 break
     return [Finding(severity="error", message=message) for message in messages]

@@ -1,0 +1,1 @@
+"""Ground truth and yardsticks: the forward solver, simulated reports, the position error bound."""

@@ -70,7 +70,7 @@ def hall_boxes() -> list[Box]:
 
 
 def hall_stations() -> list[tuple[str, tuple[float, float, float]]]:
-    """Identifiers and positions [m] of the four stations, one in each top corner."""
+    """List identifiers and positions [m] of the four stations, one in each top corner."""
     x, y, z = HALL_SIZE
     return [
         ("bs1", (0.1, 0.1, z - 0.1)),
@@ -81,7 +81,7 @@ def hall_stations() -> list[tuple[str, tuple[float, float, float]]]:
 
 
 def hall_scene() -> "trimesh.Scene":
-    """The hall as a trimesh scene, one named geometry per solid, metres, z up."""
+    """Make the hall as a trimesh scene, one named geometry per solid, metres, z up."""
     import trimesh
     from trimesh.visual.material import PBRMaterial
 
@@ -129,7 +129,13 @@ def _rack(name: str, low: tuple[float, float], high: tuple[float, float]) -> lis
             a = inner_start + j * width
             boxes.append(
                 span(
-                    a + 0.03, a + width - 0.03, z + thickness, z + 0.6, f"goods_{i + 1}{j + 1}", "wood", inset=0.04
+                    a + 0.03,
+                    a + width - 0.03,
+                    z + thickness,
+                    z + 0.6,
+                    f"goods_{i + 1}{j + 1}",
+                    "wood",
+                    inset=0.04,
                 )
             )
     return boxes

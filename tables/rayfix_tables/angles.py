@@ -23,12 +23,15 @@ def wrap(angle: ArrayLike) -> Array:
     -------
     ndarray of the same shape, rad
     """
-    wrapped = np.pi - np.mod(np.pi - np.asarray(angle, dtype=np.float64), 2.0 * np.pi)
-    return cast(Array, wrapped)
+    angle = np.asarray(angle, dtype=np.float64)
+    turned = angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
+    # Half a turn is rounded either way; the interval has one end only. Angles within it come back exactly.
+    low, high = turned <= -np.pi, turned > np.pi
+    return cast("Array", turned + 2.0 * np.pi * low - 2.0 * np.pi * high)
 
 
 def direction(azimuth: ArrayLike, zenith: ArrayLike) -> Array:
-    """Unit vectors of angles.
+    """Turn angles into unit vectors.
 
     Parameters
     ----------
@@ -61,7 +64,7 @@ def angles_of(vectors: ArrayLike) -> tuple[Array, Array]:
 
 
 def tangent(azimuth: ArrayLike, zenith: ArrayLike, centre_azimuth: ArrayLike, centre_zenith: ArrayLike) -> Array:
-    """Tangent coordinates of directions about a centre: ``(sin(zenith_c) wrap(azimuth - azimuth_c), zenith - zenith_c)``.
+    """Tangent coordinates about a centre c: ``(sin(zenith_c) wrap(azimuth - azimuth_c), zenith - zenith_c)``.
 
     The chart is exact for independent noise on azimuth and zenith: an azimuth deviation only shrinks by
     ``sin(zenith_c)``.
@@ -95,4 +98,4 @@ def local_to_scene(orientation: tuple[float, float, float]) -> Array:
     about_z = np.array([[ca, -sa, 0.0], [sa, ca, 0.0], [0.0, 0.0, 1.0]])
     about_y = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cc, -sc], [0.0, sc, cc]])
-    return cast(Array, about_z @ about_y @ about_x)
+    return cast("Array", about_z @ about_y @ about_x)

@@ -142,9 +142,7 @@ class Table:
                 orientation=_triple(np.deg2rad(group.attrs["orientation_deg"])),
                 field_of_view=float(np.deg2rad(group.attrs["field_of_view_deg"])),
             )
-            levels = tuple(
-                _read_level(file[level_path(station_id, n)], mapped) for n in range(len(group["levels"]))
-            )
+            levels = tuple(_read_level(file[level_path(station_id, n)], mapped) for n in range(len(group["levels"])))
             stations.append(station)
             parts[station_id] = StationPart(
                 station=station,
@@ -214,9 +212,7 @@ def _open_file(path: Path) -> h5py.File:
         ) from error
     if file.attrs.get("format") != FORMAT:
         file.close()
-        raise NotATableError(
-            f"{path} is an HDF5 file but not a rayfix table; give a file that 'rayfix build' wrote"
-        )
+        raise NotATableError(f"{path} is an HDF5 file but not a rayfix table; give a file that 'rayfix build' wrote")
     version = file.attrs.get("format_version")
     if version != FORMAT_VERSION:
         file.close()

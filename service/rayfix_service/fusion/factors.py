@@ -142,9 +142,7 @@ def _to_information(
         eta,
         log_scale,
     )
-    return Factor(
-        information=information, eta=eta, log_scale=log_scale, outlier=np.full(len(keep), outlier, np.int8)
-    )
+    return Factor(information=information, eta=eta, log_scale=log_scale, outlier=np.full(len(keep), outlier, np.int8))
 
 
 def _log_angle_range(observation: Observation) -> float:

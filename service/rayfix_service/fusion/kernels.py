@@ -4,6 +4,8 @@ A *factor* is what one path of the report says of the state ``z = (x, clock offs
 ``exp(log_scale + eta . z - z . information . z / 2)``, for one component of the table's cell.
 """
 
+from typing import Any
+
 import numba
 import numpy as np
 
@@ -12,8 +14,19 @@ LOG_2PI = 1.8378770664093453
 
 @numba.njit(cache=True, nogil=True)
 def condition_on_angle(
-    log_weight, u_mean, u_cov, x_mean, jacobian, x_cov, rest_mean, rest_cov, log_factor, out_log, out_mean, out_cov
-):  # type: ignore[no-untyped-def]
+    log_weight: Any,
+    u_mean: Any,
+    u_cov: Any,
+    x_mean: Any,
+    jacobian: Any,
+    x_cov: Any,
+    rest_mean: Any,
+    rest_cov: Any,
+    log_factor: Any,
+    out_log: Any,
+    out_mean: Any,
+    out_cov: Any,
+) -> None:
     """Condition a cell's components on the rest of the measured angle.
 
     Parameters
@@ -79,7 +92,13 @@ def condition_on_angle(
 
 
 @numba.njit(cache=True, nogil=True)
-def condition_on_length(log_evidence, mean, cov, length, variance):  # type: ignore[no-untyped-def]
+def condition_on_length(
+    log_evidence: Any,
+    mean: Any,
+    cov: Any,
+    length: Any,
+    variance: Any,
+) -> None:
     """Condition Gaussians over (x, path length) on a measured path length, in place.
 
     Parameters
@@ -104,7 +123,10 @@ def condition_on_length(log_evidence, mean, cov, length, variance):  # type: ign
 
 
 @numba.njit(cache=True, nogil=True)
-def cholesky(matrix, lower):  # type: ignore[no-untyped-def]
+def cholesky(
+    matrix: Any,
+    lower: Any,
+) -> Any:
     """Cholesky factor into ``lower``; False when the matrix is not positive definite."""
     size = len(matrix)
     for j in range(size):
@@ -124,7 +146,10 @@ def cholesky(matrix, lower):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def invert(lower, inverse):  # type: ignore[no-untyped-def]
+def invert(
+    lower: Any,
+    inverse: Any,
+) -> None:
     """Inverse of a matrix from its Cholesky factor, into ``inverse``."""
     size = len(lower)
     column = np.empty(size)
@@ -144,7 +169,18 @@ def invert(lower, inverse):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def to_information(log_evidence, mean, cov, clocks, offsets, variances, dimension, out_information, out_eta, out_scale):  # type: ignore[no-untyped-def]
+def to_information(
+    log_evidence: Any,
+    mean: Any,
+    cov: Any,
+    clocks: Any,
+    offsets: Any,
+    variances: Any,
+    dimension: Any,
+    out_information: Any,
+    out_eta: Any,
+    out_scale: Any,
+) -> None:
     """Turn Gaussians over (x, path length) into factors over (x, clock offsets), with times of arrival taken in.
 
     A time of arrival says ``offset = path length + clock + noise``; the path length is integrated out.
@@ -211,7 +247,14 @@ def to_information(log_evidence, mean, cov, clocks, offsets, variances, dimensio
 
 
 @numba.njit(cache=True, nogil=True)
-def log_integral(information, eta, log_scale, log_volume, lower, solved):  # type: ignore[no-untyped-def]
+def log_integral(
+    information: Any,
+    eta: Any,
+    log_scale: Any,
+    log_volume: Any,
+    lower: Any,
+    solved: Any,
+) -> Any:
     """Logarithm of the integral of a factor over the state; over the volume where nothing constrains the position.
 
     Parameters
@@ -240,7 +283,11 @@ def log_integral(information, eta, log_scale, log_volume, lower, solved):  # typ
 
 
 @numba.njit(cache=True, nogil=True)
-def _sift_down(scores, order, count):  # type: ignore[no-untyped-def]
+def _sift_down(
+    scores: Any,
+    order: Any,
+    count: Any,
+) -> None:
     """Restore the heap whose least score is at ``order[0]``, after that entry has changed."""
     i = 0
     while True:
@@ -255,7 +302,16 @@ def _sift_down(scores, order, count):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def extend_beam(information, eta, log_scale, factor_information, factor_eta, factor_scale, width, log_volume):  # type: ignore[no-untyped-def]
+def extend_beam(
+    information: Any,
+    eta: Any,
+    log_scale: Any,
+    factor_information: Any,
+    factor_eta: Any,
+    factor_scale: Any,
+    width: Any,
+    log_volume: Any,
+) -> Any:
     """Multiply every hypothesis by every alternative of a factor and keep the best products.
 
     Parameters
@@ -323,7 +379,11 @@ def extend_beam(information, eta, log_scale, factor_information, factor_eta, fac
 
 
 @numba.njit(cache=True, nogil=True)
-def _log_peak(information, eta, log_scale):  # type: ignore[no-untyped-def]
+def _log_peak(
+    information: Any,
+    eta: Any,
+    log_scale: Any,
+) -> Any:
     """Logarithm of a factor's largest value; the state may be constrained in some directions only."""
     size = len(eta)
     lower = np.zeros((size, size))
@@ -350,7 +410,12 @@ def _log_peak(information, eta, log_scale):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def climb(log_density, mean, precision, start):  # type: ignore[no-untyped-def]
+def climb(
+    log_density: Any,
+    mean: Any,
+    precision: Any,
+    start: Any,
+) -> Any:
     """Climb to a mode of a Gaussian mixture in three dimensions by the fixed point of its stationarity condition.
 
     M. A. Carreira-Perpinan, "Mode-finding for mixtures of Gaussian distributions", IEEE Trans. PAMI 22 (11), 2000:

@@ -72,9 +72,7 @@ class Locator:
             angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=0.02, zenith_stdev=0.02)
             self.locate(Report(measurements=(angle, Range(station_id=station.id, path_length=5.0, stdev=0.5))))
 
-    def _factors(
-        self, sorted_report: SortedReport, unused: dict[int, str]
-    ) -> tuple[list[Observation], list[Factor]]:
+    def _factors(self, sorted_report: SortedReport, unused: dict[int, str]) -> tuple[list[Observation], list[Factor]]:
         """Factors of the observations that can contribute; why others cannot goes to ``unused``."""
         observations, factors = [], []
         for observation in sorted_report.observations:

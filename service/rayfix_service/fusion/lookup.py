@@ -1,8 +1,8 @@
 """Find the cells of the table that answer an angle, and what is left of the measurement beside their windows.
 
-A cell's entry already holds its window N(a; 0, W). For a measured angle ``a`` with covariance R the entry is multiplied
-by what remains, N(.; a_rest, R_rest) with ``R_rest^-1 = R^-1 - W^-1`` and ``a_rest = R_rest R^-1 a``, so that the product
-is N(.; a, R) exactly: the grid's quantisation costs nothing to first order.
+A cell's entry already holds its window N(a; 0, W). For a measured angle ``a`` with covariance R the entry is
+multiplied by what remains, N(.; a_rest, R_rest) with ``R_rest^-1 = R^-1 - W^-1`` and ``a_rest = R_rest R^-1 a``, so
+that the product is N(.; a, R) exactly: the grid's quantisation costs nothing to first order.
 
 Where R is wider than the coarsest window allows, it is split into R' that fits and D = R - R', and the cells along that
 axis are summed with weights N(cell; a, D). An angle that is not measured is the limit of it: all cells alike.

@@ -7,8 +7,8 @@ Gaussian, and what lies in the free space gives the cut one's weight, mean and c
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from numpy.linalg import cholesky, inv
+from numpy.typing import NDArray
 
 from rayfix_service.fusion.kernels import climb
 from rayfix_tables.freespace import FreeSpace
@@ -83,7 +83,10 @@ def cut_to_free_space(
 
 
 def find_modes(
-    log_weight: NDArray[np.float64], mean: NDArray[np.float64], cov: NDArray[np.float64], free_space: FreeSpace
+    log_weight: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    cov: NDArray[np.float64],
+    free_space: FreeSpace,
 ) -> Modes:
     """Climb from hypotheses to modes and gather the hypotheses by the mode they belong to.
 

@@ -97,9 +97,7 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
             case TimeDifference():
                 reference = measurement.reference_station_id
                 _station(stations, reference, index, "reference_station_id")
-                differences[reference].append(
-                    (index, station.id, measurement.length_difference, measurement.stdev**2)
-                )
+                differences[reference].append((index, station.id, measurement.length_difference, measurement.stdev**2))
     num_clocks = 0
     if len({station_id for _, station_id, _, _ in arrivals}) > 1:
         # Counted from their mean, the clock's offset is a mere path length, whatever the clock shows.
@@ -160,7 +158,7 @@ def in_field_of_view(station: Station, measured: Direction) -> bool:
 
 
 def _basis(azimuth: float, zenith: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Unit vectors of growing azimuth and zenith, as columns, shape (3, 2)."""
+    """Give the unit vectors of growing azimuth and zenith, as columns, shape (3, 2)."""
     return np.array(
         [
             [-np.sin(azimuth), np.cos(zenith) * np.cos(azimuth)],
@@ -184,7 +182,9 @@ def _observations(station_id: str, draft: _Draft) -> list[Observation]:
                 lengths=tuple((length, variance) for _, length, variance in lengths),
                 readings=tuple(reading for _, reading in readings),
                 angle_index=angle[0] if angle else None,
-                timing_indices=tuple(i for i, *_ in [*lengths, *readings] if i >= 0),
+                timing_indices=tuple(
+                    i for i in [*(row[0] for row in lengths), *(row[0] for row in readings)] if i >= 0
+                ),
             )
         )
     return observations

@@ -1,0 +1,1 @@
+"""The HTTP service: routes, problems, and the server."""

@@ -1,0 +1,58 @@
+"""The Python interface: build a table, locate reports. Everything here needs an extra."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rayfix.extras import needs_extra
+from rayfix_tables.table import Table
+
+with needs_extra("service"):
+    from rayfix_service.fusion.locator import Locator as _Locator
+    from rayfix_service.fusion.report import Fix, Report
+    from rayfix_service.wire import parse_report
+
+__all__ = ["Fix", "Locator", "Report", "build"]
+
+
+def build(site_path: str | Path, table_path: str | Path | None = None, *, jobs: int = -1) -> Table:
+    """Build a site's table and open it.
+
+    Parameters
+    ----------
+    site_path : str or Path
+        Site file.
+    table_path : str or Path, optional
+        Where the table goes; beside the site file, with the suffix ``.h5``, when left out.
+    jobs : int
+        Cells that are fitted at a time; -1 for one per core.
+
+    Raises
+    ------
+    SiteError, SceneError, BuildError, TableError
+    """
+    with needs_extra("offline"):
+        from rayfix_offline.build import build_table
+
+    table_path = Path(table_path) if table_path is not None else Path(site_path).with_suffix(".h5")
+    build_table(site_path, table_path, jobs=jobs)
+    return Table.open(table_path)
+
+
+class Locator(_Locator):
+    """Answers reports from a table."""
+
+    def locate(self, report: Report | Mapping[str, Any]) -> Fix:
+        """Fuse the measurements of a report.
+
+        Parameters
+        ----------
+        report : Report or mapping
+            A mapping has the form of the JSON that ``POST /v1/positions`` takes.
+
+        Raises
+        ------
+        ReportError
+            When the report cannot be used; its ``path`` names the field.
+        """
+        return super().locate(report if isinstance(report, Report) else parse_report(report))

@@ -1,0 +1,176 @@
+"""The command line. Every error that rayfix foresees is one line on standard error and exit status 2."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from rayfix.extras import needs_extra
+from rayfix_tables.errors import RayfixError
+from rayfix_tables.version import software_version
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with status 2."""
+        self.exit(2, f"{self.prog}: {message}; see '{self.prog} --help'\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        return int(options.run(options))
+    except RayfixError as error:
+        print(f"rayfix: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("rayfix: interrupted; nothing half done was left behind", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="rayfix", description="Indoor position fixes from angles and times of arrival.")
+    parser.add_argument("--version", action="version", version=f"rayfix {software_version()}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
+
+    def add(name: str, run: object, text: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        command.set_defaults(run=run)
+        return command
+
+    demo = add("demo", _demo, "run the whole main job on the bundled hall and draw a picture of the fix")
+    demo.add_argument("-o", "--output", type=Path, default=Path("demo"), metavar="DIR", help="folder (default: demo)")
+    demo.add_argument("--jobs", type=_jobs, default=-1, help="cells fitted at a time (default: one per core)")
+
+    example = add("example", _example, "write the bundled hall: hall.glb, site.toml, report.json")
+    example.add_argument("folder", type=Path, metavar="DIR")
+
+    check = add("check", _check, "list the problems of a site and its scene, each with its remedy")
+    check.add_argument("site", type=Path, metavar="SITE.toml")
+
+    build = add("build", _build, "build the table of a site")
+    build.add_argument("site", type=Path, metavar="SITE.toml")
+    build.add_argument("-o", "--output", type=Path, required=True, metavar="T.h5")
+    build.add_argument("--jobs", type=_jobs, default=-1, help="cells fitted at a time (default: one per core)")
+    build.add_argument("--no-progress", action="store_true", help="show no progress bar")
+
+    info = add("info", _info, "show what a table holds")
+    info.add_argument("table", type=Path, metavar="T.h5")
+    info.add_argument("--json", action="store_true", help="as JSON")
+
+    verify = add("verify", _verify, "read a whole table and compare its checksums")
+    verify.add_argument("table", type=Path, metavar="T.h5")
+
+    locate = add("locate", _locate, "locate one report")
+    locate.add_argument("table", type=Path, metavar="T.h5")
+    locate.add_argument("report", type=Path, metavar="REPORT.json")
+    locate.add_argument("--json", action="store_true", help="the answer of the HTTP interface")
+
+    serve = add("serve", _serve, "serve a table over HTTP")
+    serve.add_argument("table", type=Path, metavar="T.h5")
+    serve.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
+    serve.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
+    serve.add_argument("--workers", type=int, default=1, help="processes that answer (default: 1)")
+    return parser
+
+
+def _jobs(text: str) -> int:
+    jobs = int(text)
+    if jobs == 0 or jobs < -1:
+        raise argparse.ArgumentTypeError(f"{jobs} is not a number of jobs; give 1 or more, or -1 for one per core")
+    return jobs
+
+
+def _demo(options: argparse.Namespace) -> int:
+    with needs_extra("all"):
+        from rayfix.demo import run_demo
+    run_demo(options.output, jobs=options.jobs)
+    return 0
+
+
+def _example(options: argparse.Namespace) -> int:
+    with needs_extra("offline"):
+        from rayfix.example.files import write_example
+
+        site = write_example(options.folder)
+    print(f"Wrote {site} with its scene and a report. Next: rayfix build {site} -o {options.folder / 'hall.h5'}")
+    return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    with needs_extra("offline"):
+        from rayfix_offline.site import read_site
+        from rayfix_offline.twin import prepare_twin
+    twin = prepare_twin(read_site(options.site), options.site.parent)
+    for finding in twin.findings:
+        print(f"{finding.severity}: {finding.message}")
+    errors = sum(finding.severity == "error" for finding in twin.findings)
+    warnings = len(twin.findings) - errors
+    size = " x ".join(f"{length:.6g}" for length in twin.scene.bounds[1] - twin.scene.bounds[0])
+    print(
+        f"{options.site}: scene of {size} m with {len(twin.scene.faces):,} triangles on {len(twin.planes):,} planes, "
+        f"{twin.free_space.volume:,.0f} m3 of free space; {errors} errors, {warnings} warnings"
+    )
+    return 2 if errors else 0
+
+
+def _build(options: argparse.Namespace) -> int:
+    with needs_extra("offline"):
+        from rayfix_offline.build import build_table
+
+    from rayfix.console import build_progress, print_build_summary
+
+    with build_progress(enabled=not options.no_progress) as progress:
+        summary = build_table(options.site, options.output, jobs=options.jobs, progress=progress)
+    for warning in summary.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    print_build_summary(summary)
+    return 0
+
+
+def _info(options: argparse.Namespace) -> int:
+    from rayfix.console import print_table_info, table_info
+    from rayfix_tables.table import Table
+
+    table = Table.open(options.table)
+    if options.json:
+        print(json.dumps(table_info(table), indent=2))
+    else:
+        print_table_info(table)
+    return 0
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from rayfix_tables.table import Table
+
+    table = Table.open(options.table)
+    table.verify()
+    print(f"{options.table} is whole: table_id {table.table_id}")
+    return 0
+
+
+def _locate(options: argparse.Namespace) -> int:
+    with needs_extra("service"):
+        from rayfix.console import print_fix
+        from rayfix.locate import locate_file
+    document = locate_file(options.table, options.report)
+    if options.json:
+        print(json.dumps(document, indent=2))
+    else:
+        print_fix(document)
+    return 0
+
+
+def _serve(options: argparse.Namespace) -> int:
+    with needs_extra("service"):
+        from rayfix_service.http.server import serve
+    serve(options.table, host=options.host, port=options.port, workers=options.workers)
+    return 0

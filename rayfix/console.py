@@ -1,0 +1,155 @@
+"""What the command line shows: progress bars, summaries, tables and fixes."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table as Grid
+
+from rayfix_tables.table import Table
+
+if TYPE_CHECKING:
+    from rayfix_offline.build import BuildSummary
+    from rayfix_offline.build import Progress as BuildProgress
+
+
+@contextmanager
+def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
+    """Show a progress bar with the remaining time on standard error."""
+    if not enabled:
+        yield None
+        return
+    bar = Progress(
+        TextColumn("{task.description:<24}"),
+        BarColumn(bar_width=20),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("remaining"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+    )
+    with bar:
+        task = bar.add_task("starting", total=None)
+
+        def show(stage: str, done: int, total: int) -> None:
+            bar.update(task, description=stage, completed=done, total=total or None)
+
+        yield show
+
+
+def print_build_summary(summary: "BuildSummary") -> None:
+    """Print a line per station and one for the whole."""
+    grid = Grid("station", title=f"Table {summary.path}", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("cells", "filled", "components", "MB", "lost rays"):
+        grid.add_column(heading, justify="right")
+    for k in range(max(len(s.coverage) for s in summary.stations)):
+        grid.add_column(f"<= {k}", justify="right")
+    for s in summary.stations:
+        grid.add_row(
+            s.station_id,
+            str(s.num_cells),
+            str(s.num_filled_cells),
+            str(s.num_components),
+            f"{s.num_bytes / 1e6:.1f}",
+            f"{s.lost_ray_share:.3%}",
+            *(f"{share:.0%}" for share in s.coverage),
+        )
+    grid.caption = "filled: cells that rays come to; <= k: share of the free space reached with at most k reflections"
+    console = Console()
+    console.print(grid)
+    console.print(
+        f"{summary.num_bytes / 1e6:.1f} MB in {summary.seconds:.1f} s; table_id {summary.table_id}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def table_info(table: Table) -> dict[str, Any]:
+    """Facts about a table, as JSON-compatible data."""
+    return {
+        "path": str(table.path),
+        "table_id": table.table_id,
+        "format_version": table.format_version,
+        "software_version": table.software_version,
+        "site": table.site.name,
+        "bytes": table.path.stat().st_size,
+        "faces": len(table.scene.faces),
+        "free_space_m3": round(table.scene.free_space.volume, 3),
+        "stations": [
+            {
+                "id": station_id,
+                "position_m": list(part.station.position),
+                "lost_ray_share": part.lost_ray_share,
+                "coverage": list(part.coverage),
+                "levels": [
+                    {
+                        "window_deg": round(float(np.rad2deg(level.window)), 9),
+                        "cells": level.num_cells,
+                        "components": level.num_components,
+                    }
+                    for level in part.levels
+                ],
+            }
+            for station_id, part in table.parts.items()
+        ],
+    }
+
+
+def print_table_info(table: Table) -> None:
+    """Print facts about a table."""
+    facts = table_info(table)
+    console = Console()
+    for line in (
+        f"{facts['path']}: site '{facts['site']}', {facts['bytes'] / 1e6:.1f} MB",
+        f"table_id {facts['table_id']}",
+        f"format {facts['format_version']}, written by rayfix {facts['software_version']}",
+        f"scene of {facts['faces']:,} triangles, {facts['free_space_m3']:,.0f} m3 of free space",
+    ):
+        console.print(line, highlight=False, soft_wrap=True)
+    grid = Grid("station", "position [m]", "window [deg]", "cells", "components")
+    for station in facts["stations"]:
+        for n, level in enumerate(station["levels"]):
+            grid.add_row(
+                station["id"] if n == 0 else "",
+                ", ".join(f"{v:g}" for v in station["position_m"]) if n == 0 else "",
+                f"{level['window_deg']:g}",
+                f"{level['cells']:,}",
+                f"{level['components']:,}",
+            )
+    console.print(grid)
+
+
+def print_fix(document: Mapping[str, Any]) -> None:
+    """Print the answer to a report."""
+    if document["position"] is None:
+        print(f"{document['status']}: no measurement could be used")
+    else:
+        print(f"{document['status']}: {place(document['position'])}")
+        print(
+            f"  within {document['horizontal_accuracy_m']:.2f} m horizontally and "
+            f"{document['vertical_accuracy_m']:.2f} m vertically with a probability of {document['confidence']:.0%}"
+        )
+        for n, candidate in enumerate(document["candidates"]):
+            name = "this position" if n == 0 else f"rival {n}: {place(candidate['position'])},"
+            print(f"  {name} has a probability of {candidate['probability']:.1%}")
+    for outcome in document["measurements"]:
+        if not outcome["used"]:
+            print(f"  measurement {outcome['index']} not used: {outcome['reason']}")
+        elif outcome["outlier_probability"] > 0.5:
+            print(f"  measurement {outcome['index']} is an outlier ({outcome['outlier_probability']:.0%})")
+
+
+def place(position: Mapping[str, float]) -> str:
+    """Coordinates as a person reads them."""
+    return f"({position['x']:.2f}, {position['y']:.2f}, {position['z']:.2f}) m"

@@ -1,0 +1,127 @@
+"""How far fixes are from the truth: uniform drops, simulated reports, errors beside the position error bound."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix.evaluation.bound import position_error_bound
+from rayfix.evaluation.forward import ForwardSolver, Paths
+from rayfix.evaluation.simulate import Noise, Timing, simulate_report, uniform_drops
+from rayfix_service.fusion.locator import Locator
+from rayfix_service.wire import parse_report
+from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.table import Table
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drop:
+    """A true position [m], shape (3,), and the paths to it from every station that hears it."""
+
+    position: NDArray[np.float64]
+    paths: Mapping[str, Paths]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DropErrors:
+    """What became of drops.
+
+    Attributes
+    ----------
+    error : ndarray of shape (n_drops,), m
+        Distance of the fix from the truth; inf where there was no fix.
+    bound : ndarray of shape (n_drops,), m
+        Position error bound of the same measurements; inf where they do not determine a position.
+    seconds : ndarray of shape (n_drops,)
+        Time that the fix took; 0 where no station heard the drop.
+    status : tuple of str
+        Status of each fix; "unheard" where no station heard the drop.
+    """
+
+    error: NDArray[np.float64]
+    bound: NDArray[np.float64]
+    seconds: NDArray[np.float64]
+    status: tuple[str, ...]
+
+
+def clear_of_solids(free_space: FreeSpace, points: NDArray[np.float64], *, margin: float) -> NDArray[np.bool_]:
+    """Whether points and their surroundings lie in free space.
+
+    Parameters
+    ----------
+    points : ndarray of shape (n, 3), m
+    margin : float, m
+        Distance along each axis that must be free too.
+    """
+    around = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * margin
+    return np.asarray(free_space.contains(points[:, None, :] + around).all(axis=1))
+
+
+def solver_of(table: Table) -> ForwardSolver:
+    """Return the forward solver of a table's scene, with the reflections and losses of its site."""
+    propagation = table.site.document["propagation"]
+    return ForwardSolver.from_mesh(
+        np.array(table.scene.vertices),
+        np.array(table.scene.faces),
+        max_reflections=propagation["max_reflections"],
+        max_path_length=propagation["max_path_length_m"],
+        reflection_loss_db=propagation["reflection_loss_db"],
+    )
+
+
+def drop_uniformly(
+    table: Table, count: int, rng: np.random.Generator, *, margin: float = 0.06, max_height: float = np.inf
+) -> list[Drop]:
+    """Drop UEs uniformly into the free space and find the paths to them.
+
+    Parameters
+    ----------
+    margin : float, m
+        Least distance, along each axis, from solids and the building's shell.
+    max_height : float, m
+        Greatest z of a drop.
+    """
+    solver = solver_of(table)
+    stations = {s.id: solver.station(np.array(s.position)) for s in table.site.stations}
+    free_space = table.scene.free_space
+    low = free_space.origin
+    high = low + np.array(free_space.free.shape) * free_space.voxel_size
+    high[2] = min(high[2], max_height)
+    points = uniform_drops(lambda p: clear_of_solids(free_space, p, margin=margin), low, high, count, rng)
+    drops = []
+    for point in points:
+        paths = {name: station.paths(point) for name, station in stations.items()}
+        drops.append(Drop(position=point, paths={name: found for name, found in paths.items() if len(found)}))
+    return drops
+
+
+def locate_drops(
+    locator: Locator, drops: Sequence[Drop], noise: Noise, *, timing: Timing, rng: np.random.Generator
+) -> DropErrors:
+    """Simulate the report of the strongest paths to each drop, locate it, and compare with the truth."""
+    positions = {s.id: s.position for s in locator.table.site.stations}
+    error, bound = np.full(len(drops), np.inf), np.full(len(drops), np.inf)
+    seconds = np.zeros(len(drops))
+    status = []
+    for n, drop in enumerate(drops):
+        if not drop.paths:
+            status.append("unheard")
+            continue
+        report = parse_report(simulate_report(drop.paths, noise, rng=rng, timing=timing))
+        begin = perf_counter()
+        fix = locator.locate(report)
+        seconds[n] = perf_counter() - begin
+        status.append(fix.status)
+        if fix.position is not None:
+            error[n] = np.linalg.norm(fix.position - drop.position)
+        bound[n] = position_error_bound(
+            np.array([positions[name] for name in drop.paths]),
+            list(drop.paths.values()),
+            [0] * len(drop.paths),
+            drop.position,
+            noise,
+            timing=timing,
+        )
+    return DropErrors(error=error, bound=bound, seconds=seconds, status=tuple(status))

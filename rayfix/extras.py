@@ -1,0 +1,33 @@
+"""One clear message where an optional dependency is missing."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rayfix_tables.errors import RayfixError
+
+
+class MissingExtraError(RayfixError, ImportError):
+    """A part of rayfix is used whose dependencies are not installed."""
+
+
+@contextmanager
+def needs_extra(extra: str) -> Iterator[None]:
+    """Say which extra to install when an import within fails.
+
+    Raises
+    ------
+    MissingExtraError
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] in {
+            "rayfix",
+            "rayfix_offline",
+            "rayfix_service",
+            "rayfix_tables",
+        }:
+            raise
+        raise MissingExtraError(
+            f"the module '{error.name}' is not installed; install it with: pip install 'rayfix[{extra}]'"
+        ) from error

@@ -1,0 +1,128 @@
+"""Examples of the OpenAPI document. They are of the bundled hall and answer 200 there."""
+
+from typing import Any
+
+
+def _aoa(station_id: str, azimuth_deg: float, zenith_deg: float) -> dict[str, Any]:
+    return {
+        "type": "aoa",
+        "station_id": station_id,
+        "azimuth_deg": azimuth_deg,
+        "zenith_deg": zenith_deg,
+        "azimuth_stdev_deg": 1.0,
+        "zenith_stdev_deg": 1.0,
+    }
+
+
+# All measurements have a line of sight to (7.0, 4.0, 1.5), and errors of the size of their deviations.
+_AOA_1 = _aoa("bs1", 29.9, 96.1)
+_AOA_2 = _aoa("bs2", 102.4, 103.3)
+_AOA_3 = _aoa("bs3", -93.2, 93.1)
+
+REPORT_EXAMPLES: dict[str, dict[str, Any]] = {
+    "angle_and_time": {
+        "summary": "One station: its angle of arrival and propagation time",
+        "value": {
+            "target_id": "agv-7",
+            "timestamp": "2026-01-31T10:00:00.250Z",
+            "measurements": [_AOA_1, {"type": "pt", "station_id": "bs1", "range_m": 7.8, "stdev_m": 0.5}],
+        },
+    },
+    "angles": {
+        "summary": "Three stations: angles of arrival alone",
+        "value": {"target_id": "agv-7", "measurements": [_AOA_1, _AOA_2, _AOA_3]},
+    },
+    "time_differences": {
+        "summary": "An angle of arrival, and time differences to its station, in metres or nanoseconds",
+        "value": {
+            "measurements": [
+                _AOA_1,
+                {
+                    "type": "tdoa",
+                    "station_id": "bs2",
+                    "reference_station_id": "bs1",
+                    "range_difference_m": -4.1,
+                    "stdev_m": 0.5,
+                },
+                {
+                    "type": "tdoa",
+                    "station_id": "bs3",
+                    "reference_station_id": "bs1",
+                    "delay_difference_ns": 20.8,
+                    "stdev_ns": 1.7,
+                },
+            ]
+        },
+    },
+    "unsynchronised_clock": {
+        "summary": "Angles, and times of arrival that share an unknown clock offset",
+        "value": {
+            "measurements": [
+                _AOA_1,
+                _AOA_2,
+                {"type": "toa", "station_id": "bs1", "range_m": 131.2, "stdev_m": 0.5},
+                {"type": "toa", "station_id": "bs2", "range_m": 127.0, "stdev_m": 0.5},
+            ]
+        },
+    },
+    "azimuth_only": {
+        "summary": "Sensors that measure no zenith angle, and count azimuths up to 360",
+        "value": {
+            "target_id": "tag-61cf",
+            "measurements": [
+                {"type": "aoa", "station_id": "bs1", "azimuth_deg": 31.0, "azimuth_stdev_deg": 5.0},
+                {"type": "aoa", "station_id": "bs3", "azimuth_deg": 263.0, "azimuth_stdev_deg": 5.0},
+                {"type": "pt", "station_id": "bs2", "delay_ns": 13.4, "stdev_ns": 1.7},
+            ],
+        },
+    },
+}
+"""Bodies of ``POST /v1/positions``."""
+
+BATCH_EXAMPLES: dict[str, dict[str, Any]] = {
+    "two_reports": {
+        "summary": "Two reports",
+        "value": {"reports": [REPORT_EXAMPLES["angle_and_time"]["value"], REPORT_EXAMPLES["angles"]["value"]]},
+    },
+}
+"""Bodies of ``POST /v1/positions/batch``."""
+
+_POSITION = {"x": 6.81, "y": 3.94, "z": 1.57}
+_COVARIANCE = [[0.165, 0.085, -0.018], [0.085, 0.07, -0.01], [-0.018, -0.01, 0.023]]
+
+FIX_EXAMPLE: dict[str, Any] = {
+    "target_id": "agv-7",
+    "timestamp": "2026-01-31T10:00:00.250Z",
+    "status": "ok",
+    "position": _POSITION,
+    "covariance_m2": _COVARIANCE,
+    "horizontal_accuracy_m": 0.48,
+    "vertical_accuracy_m": 0.15,
+    "confidence": 0.68,
+    "candidates": [
+        {"probability": 0.986, "position": _POSITION, "covariance_m2": _COVARIANCE},
+        {
+            "probability": 0.012,
+            "position": {"x": 6.82, "y": 4.2, "z": 2.08},
+            "covariance_m2": [[0.123, 0.045, 0.009], [0.045, 0.05, 0.003], [0.009, 0.003, 0.008]],
+        },
+    ],
+    "measurements": [
+        {"index": 0, "used": True, "outlier_probability": 0.0},
+        {"index": 1, "used": True, "outlier_probability": 0.002},
+    ],
+    "table_id": "5c3b1f0e9d8a7766554433221100ffeeddccbbaa99887766554433221100ffee",
+    "compute_ms": 1.6,
+}
+"""An answer to the first report."""
+
+_MESSAGE = "measurements[0].azimuth_stdev_deg is -1; give a positive standard deviation in degrees, 1e-06 to 360"
+
+PROBLEM_EXAMPLE: dict[str, Any] = {
+    "type": "urn:rayfix:problem:invalid-report",
+    "title": "Report cannot be used",
+    "status": 422,
+    "detail": _MESSAGE,
+    "errors": [{"path": "measurements[0].azimuth_stdev_deg", "message": _MESSAGE}],
+}
+"""The answer to a report that cannot be used."""

@@ -1,0 +1,192 @@
+"""Errors as RFC 9457 problem documents (``application/problem+json``)."""
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from rayfix_service.wire import FieldProblem, MalformedJsonError, path_text, problems_of
+from rayfix_tables.errors import ReportError
+
+MEDIA_TYPE = "application/problem+json"
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProblemKind:
+    """What RFC 9457 calls a problem type: its status, its title, and the last part of its URI."""
+
+    status: int
+    title: str
+    name: str
+
+    @property
+    def uri(self) -> str:
+        """URI of the type, for programs to compare."""
+        return f"urn:rayfix:problem:{self.name}"
+
+
+MALFORMED_JSON = ProblemKind(status=400, title="Malformed JSON", name="malformed-json")
+CONNECTION_ENDED = ProblemKind(status=400, title="Connection ended", name="connection-ended")
+NOT_FOUND = ProblemKind(status=404, title="Not found", name="not-found")
+METHOD_NOT_ALLOWED = ProblemKind(status=405, title="Method not allowed", name="method-not-allowed")
+BODY_TOO_LARGE = ProblemKind(status=413, title="Body too large", name="body-too-large")
+UNSUPPORTED_MEDIA_TYPE = ProblemKind(status=415, title="Unsupported media type", name="unsupported-media-type")
+INVALID_REPORT = ProblemKind(status=422, title="Report cannot be used", name="invalid-report")
+INTERNAL_ERROR = ProblemKind(status=500, title="Internal error", name="internal-error")
+NOT_READY = ProblemKind(status=503, title="Not ready", name="not-ready")
+
+KINDS = (
+    MALFORMED_JSON,
+    NOT_FOUND,
+    METHOD_NOT_ALLOWED,
+    BODY_TOO_LARGE,
+    UNSUPPORTED_MEDIA_TYPE,
+    INVALID_REPORT,
+    INTERNAL_ERROR,
+    NOT_READY,
+)
+"""Every kind that a client may see; with its connection ended, there is none that sees."""
+
+
+class ProblemField(BaseModel):
+    """One offending field."""
+
+    path: str = Field(
+        description="where in the document, empty for the whole of it",
+        examples=["measurements[0].azimuth_deg"],
+    )
+    message: str = Field(description="the field, its value, and what to do about it")
+
+
+class Problem(BaseModel):
+    """A problem document of RFC 9457."""
+
+    type: str = Field(description="URI of the kind of problem", examples=[INVALID_REPORT.uri])
+    title: str = Field(description="the kind of problem in words", examples=[INVALID_REPORT.title])
+    status: int = Field(description="the HTTP status", examples=[INVALID_REPORT.status])
+    detail: str = Field(description="what is wrong this time, and what to do about it")
+    errors: list[ProblemField] = Field(description="every offending field, at most 50")
+
+
+class ProblemError(Exception):
+    """Ends a request with a problem."""
+
+    def __init__(self, kind: ProblemKind, detail: str, *, headers: Mapping[str, str] | None = None) -> None:
+        super().__init__(detail)
+        self.kind = kind
+        self.headers = headers
+
+
+def problem_document(kind: ProblemKind, detail: str, errors: Iterable[FieldProblem] = ()) -> dict[str, Any]:
+    """Build the document that :class:`Problem` describes."""
+    return {
+        "type": kind.uri,
+        "title": kind.title,
+        "status": kind.status,
+        "detail": detail,
+        "errors": [{"path": path_text(error.path), "message": error.message} for error in errors],
+    }
+
+
+def report_problem(error: ReportError) -> dict[str, Any]:
+    """Build the document of a report that cannot be used."""
+    kind = MALFORMED_JSON if isinstance(error, MalformedJsonError) else INVALID_REPORT
+    return problem_document(kind, str(error), problems_of(error))
+
+
+def internal_problem() -> dict[str, Any]:
+    """Build the document of a defect. It says nothing of the cause, which the log has."""
+    return problem_document(
+        INTERNAL_ERROR, "this is a defect of the service, not of the request; its log has the cause"
+    )
+
+
+def problem_response(document: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> JSONResponse:
+    """Answer with a problem document."""
+    return JSONResponse(document, status_code=document["status"], headers=headers, media_type=MEDIA_TYPE)
+
+
+def problem_responses(*kinds: ProblemKind) -> dict[int | str, dict[str, Any]]:
+    """Describe the kinds of problem of a route for the OpenAPI document."""
+    schema = {"$ref": f"#/components/schemas/{Problem.__name__}"}
+    return {kind.status: {"description": kind.title, "content": {MEDIA_TYPE: {"schema": schema}}} for kind in kinds}
+
+
+async def _answer_problem(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, ProblemError)
+    return problem_response(problem_document(error.kind, str(error)), error.headers)
+
+
+async def _answer_report(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, ReportError)
+    return problem_response(report_problem(error))
+
+
+async def _answer_validation(request: Request, error: Exception) -> JSONResponse:
+    """Answer a parameter that FastAPI itself refuses, such as one of a query."""
+    assert isinstance(error, RequestValidationError)
+    errors = [
+        FieldProblem(path=tuple(e["loc"][1:]), message=f"{path_text(tuple(e['loc'][1:]))}: {e['msg']}")
+        for e in error.errors()
+    ]
+    return problem_response(problem_document(INVALID_REPORT, errors[0].message, errors))
+
+
+async def _answer_http(request: Request, error: Exception) -> JSONResponse:
+    """Answer what the router or Starlette refuses."""
+    assert isinstance(error, HTTPException)
+    if error.status_code == 404:
+        detail = f"there is nothing at {request.url.path}; /docs lists what there is"
+        return problem_response(problem_document(NOT_FOUND, detail))
+    if error.status_code == 405:
+        allowed = (error.headers or {}).get("Allow", "another method")
+        detail = f"{request.method} is not possible at {request.url.path}; use {allowed}"
+        return problem_response(problem_document(METHOD_NOT_ALLOWED, detail), error.headers)
+    kind = ProblemKind(status=error.status_code, title="HTTP error", name="http-error")
+    return problem_response(problem_document(kind, str(error.detail)), error.headers)
+
+
+class LastResort:
+    """Middleware that turns an exception nobody handled into a problem, and logs it once.
+
+    A handler for Exception would do so too, but Starlette raises the exception again after that, and the
+    server logs it a second time.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        started = False
+
+        async def send_noting(message: Message) -> None:
+            nonlocal started
+            started = started or message["type"] == "http.response.start"
+            await send(message)
+
+        try:
+            await self.app(scope, receive, send_noting)
+        except Exception:
+            if scope["type"] != "http" or started:
+                raise  # only the server can cut the connection, and it logs
+            _log.exception("request %s %s failed", scope["method"], scope["path"])
+            await problem_response(internal_problem())(scope, receive, send)
+
+
+def install_problems(app: FastAPI) -> None:
+    """Make every error of `app` a problem document."""
+    app.add_exception_handler(ProblemError, _answer_problem)
+    app.add_exception_handler(ReportError, _answer_report)
+    app.add_exception_handler(RequestValidationError, _answer_validation)
+    app.add_exception_handler(HTTPException, _answer_http)
+    app.add_middleware(LastResort)

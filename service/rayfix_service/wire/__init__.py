@@ -1,0 +1,52 @@
+"""The JSON of the HTTP interface, and its way to a report and back from a fix.
+
+On the wire an angle is in degrees, a length in metres and a delay in nanoseconds, and each name says so.
+Inside, everything is SI and radians. This package is the only place where the one becomes the other.
+"""
+
+from rayfix_service.wire.documents import (
+    MAX_MEASUREMENTS,
+    MAX_REPORTS,
+    METRES_PER_NANOSECOND,
+    BatchDocument,
+    ReportDocument,
+    WireModel,
+)
+from rayfix_service.wire.problems import (
+    FieldProblem,
+    InvalidReportError,
+    MalformedJsonError,
+    path_text,
+    problems_of,
+)
+from rayfix_service.wire.request import parse_report, read_json
+from rayfix_service.wire.response import (
+    CONFIDENCE,
+    FixDocument,
+    Point,
+    fix_to_document,
+    horizontal_accuracy,
+    vertical_accuracy,
+)
+
+__all__ = [
+    "CONFIDENCE",
+    "MAX_MEASUREMENTS",
+    "MAX_REPORTS",
+    "METRES_PER_NANOSECOND",
+    "BatchDocument",
+    "FieldProblem",
+    "FixDocument",
+    "InvalidReportError",
+    "MalformedJsonError",
+    "Point",
+    "ReportDocument",
+    "WireModel",
+    "fix_to_document",
+    "horizontal_accuracy",
+    "parse_report",
+    "path_text",
+    "problems_of",
+    "read_json",
+    "vertical_accuracy",
+]

@@ -1,0 +1,143 @@
+"""What can be wrong with a document, in words that name the field, its value and the remedy.
+
+::
+
+    ReportError                 (rayfix_tables.errors)
+    ├── MalformedJsonError      the bytes are not JSON
+    └── InvalidReportError      JSON, but not a report; ``problems`` lists all that is wrong
+"""
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import get_args
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from rayfix_service.wire.documents import MEASUREMENT_DOCUMENTS, MISFIT, ReportDocument, WireModel
+from rayfix_tables.errors import ReportError
+
+_MAX_PROBLEMS = 50  # a megabyte of unknown keys must not become megabytes of complaints
+_MAX_SHOWN = 60  # characters of a value or a key that a message repeats
+
+Path = tuple[str | int, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldProblem:
+    """One thing that is wrong with a document.
+
+    Attributes
+    ----------
+    path : tuple of (str or int)
+        The offending field, e.g. ``("measurements", 0, "azimuth_deg")``; empty for the document as a whole.
+    message : str
+        The field, its value, and what to do about it.
+    """
+
+    path: Path
+    message: str
+
+
+class MalformedJsonError(ReportError):
+    """The bytes are not a JSON text."""
+
+
+class InvalidReportError(ReportError):
+    """A document that is not a valid report.
+
+    Parameters
+    ----------
+    problems : tuple of FieldProblem
+        At least one; the first gives the error its message and its ``path``.
+    """
+
+    def __init__(self, problems: tuple[FieldProblem, ...]) -> None:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        super().__init__(problems[0].message + more, path=problems[0].path)
+        self.problems = problems
+
+
+def problems_of(error: ReportError) -> tuple[FieldProblem, ...]:
+    """List all that is wrong according to `error`: one thing, unless it is an :class:`InvalidReportError`."""
+    if isinstance(error, InvalidReportError):
+        return error.problems
+    return (FieldProblem(path=error.path, message=str(error)),)
+
+
+def problems_of_validation(error: ValidationError) -> tuple[FieldProblem, ...]:
+    """Say in this project's words what pydantic found wrong with a report, at most 50 things."""
+    details = error.errors(include_url=False)[:_MAX_PROBLEMS]
+    # A misspelt key comes with a missing one; the first message should be the one that says so.
+    details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
+    return tuple(_problem(detail) for detail in details)
+
+
+def path_text(path: Path) -> str:
+    """Write a path as people do: ``measurements[0].azimuth_deg``."""
+    text = ""
+    for step in path:
+        # What is no plain name is quoted, and its control characters with it.
+        plain = isinstance(step, str) and step.isidentifier() and len(step) <= _MAX_SHOWN
+        text += f".{step}" if plain else f"[{step if isinstance(step, int) else repr(_shortened(step))}]"
+    return text.removeprefix(".")
+
+
+def shown(value: object) -> str:
+    """Name a value of a document in a message, briefly and in the words of JSON."""
+    if value is None or isinstance(value, bool):
+        return "null" if value is None else str(value).lower()
+    if isinstance(value, Mapping):
+        return "an object"
+    if isinstance(value, list | tuple):
+        return f"an array of length {len(value)}"
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "infinite"
+    if isinstance(value, int) and abs(value) > 10**20:
+        return "a number of more than 20 digits"  # repr fails beyond 4300
+    if isinstance(value, str):
+        return repr(_shortened(value))
+    if isinstance(value, int | float):
+        return repr(value)
+    return f"a Python {type(value).__name__}"
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
+
+
+def _problem(error: ErrorDetails) -> FieldProblem:
+    path, kind, value, context = error["loc"], error["type"], error["input"], error.get("ctx", {})
+    model: type[WireModel] = ReportDocument
+    if len(path) > 2 and path[0] == "measurements":
+        # pydantic puts the tag of the union into the path; the document has no such step.
+        model, path = MEASUREMENT_DOCUMENTS[str(path[2])], (*path[:2], *path[3:])
+    if kind == MISFIT:
+        path = path if context["field"] is None else (*path, context["field"])
+        text = context["text"]
+    elif kind in ("extra_forbidden", "invalid_key"):
+        known = list(model.model_fields)
+        close = difflib.get_close_matches(_shortened(str(path[-1])), known, n=1)
+        remedy = f"did you mean {close[0]}?" if close else f"leave it out or use one of {', '.join(known)}"
+        text = f"is an unknown key; {remedy}"
+    elif kind in ("union_tag_invalid", "union_tag_not_found"):
+        path = (*path, "type")
+        found = f"is {shown(value['type'])}" if "type" in value else "is missing"
+        text = f"{found}; give one of {', '.join(MEASUREMENT_DOCUMENTS)}"
+    elif not path:
+        text = f'is {shown(value)}; give a JSON object, e.g. {{"measurements": [...]}}'
+    elif len(path) == 2:
+        text = f'is {shown(value)}; give a JSON object, e.g. {{"type": "aoa", "station_id": "bs1", ...}}'
+    else:
+        found = "is missing" if kind == "missing" else f"is {shown(value)}"
+        text = f"{found}; give {_description(model, str(path[-1]))}"
+    return FieldProblem(path=path, message=f"{path_text(path) or 'the report'} {text}")
+
+
+def _description(model: type[WireModel], name: str) -> str:
+    """Find what a field takes; for an optional field this sits inside its annotation."""
+    field = model.model_fields[name]
+    inner = (m.description for a in get_args(field.annotation) for m in getattr(a, "__metadata__", ()))
+    return field.description or next(inner, None) or f"one of {', '.join(get_args(field.annotation))}"

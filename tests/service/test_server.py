@@ -1,0 +1,175 @@
+"""The HTTP service as a process of its own, and what it checks before it starts."""
+
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+
+from rayfix_service.http.examples import REPORT_EXAMPLES
+from rayfix_service.http.server import (
+    TABLE_VARIABLE,
+    ServiceError,
+    app_from_environment,
+    check_address,
+    serve,
+)
+from rayfix_tables.errors import NotATableError, TableError
+
+REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]
+
+
+class ServerProcess:
+    """A server in a process of its own, on a free loopback port."""
+
+    def __init__(self, table_path: Path, workers: int) -> None:
+        code = (
+            "import sys; from rayfix_service.http.server import serve; "
+            "serve(sys.argv[1], port=0, workers=int(sys.argv[2]))"
+        )
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", code, str(table_path), str(workers)], stderr=subprocess.PIPE, text=True
+        )
+        self.log: list[str] = []
+        self._listening = threading.Event()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.log.append(line)
+            if "running on http://" in line:
+                self._listening.set()
+
+    def port(self) -> int:
+        """Wait until it listens, and return the port."""
+        assert self._listening.wait(60), "".join(self.log)
+        (line,) = (line for line in self.log if "running on http://" in line)
+        return int(re.findall(r"http://127\.0\.0\.1:(\d+)", line)[0])
+
+    def wait_until_ready(self, http: httpx.Client) -> None:
+        """Wait until ``/readyz`` is 200."""
+        deadline = time.monotonic() + 100
+        while True:
+            try:
+                if http.get("/readyz").status_code == 200:
+                    return
+            except httpx.ConnectError:  # a worker that does not listen yet
+                pass
+            assert time.monotonic() < deadline, "".join(self.log)
+            time.sleep(0.05)
+
+    def stop(self) -> str:
+        """Ask the server to end, and return its log."""
+        self.process.send_signal(signal.SIGTERM)
+        try:
+            self.process.wait(30)
+        finally:
+            self.process.kill()
+            self._reader.join(10)
+            assert self.process.stderr is not None
+            self.process.stderr.close()
+        return "".join(self.log)
+
+
+def test_a_real_server_answers_and_ends(hall_table_path: Path):
+    server = ServerProcess(hall_table_path, workers=1)
+    try:
+        port = server.port()
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30, trust_env=False) as http:
+            assert http.get("/livez").status_code == 200
+            server.wait_until_ready(http)
+            fix = http.post("/v1/positions", json=REPORT)
+            assert fix.status_code == 200
+            assert fix.json()["position"] is not None
+            for body, status in [(b" " * (2 << 20), 413), (b"{", 400)]:
+                refusal = http.post("/v1/positions", content=body, headers={"content-type": "application/json"})
+                assert refusal.status_code == refusal.json()["status"] == status
+                assert refusal.headers["content-type"] == "application/problem+json"
+        # A client that leaves within its body is no error, and one that leaves its batch ends that.
+        batch = json.dumps({"reports": [REPORT] * 1000})
+        for path, length, body in [
+            ("/v1/positions", 99, "{"),
+            ("/v1/positions/batch", len(batch), batch),
+        ]:
+            head = [f"POST {path} HTTP/1.1", "Host: x", "Content-Type: application/json"]
+            with socket.create_connection(("127.0.0.1", port)) as connection:
+                connection.sendall("\r\n".join([*head, f"Content-Length: {length}", "", body]).encode())
+                time.sleep(0.2)
+        deadline = time.monotonic() + 5
+        while not any("batch given up after" in line for line in server.log):
+            assert time.monotonic() < deadline, "".join(server.log)
+            time.sleep(0.02)
+        with pytest.raises(ServiceError, match=f"port {port}.*give another"):
+            serve(hall_table_path, port=port)
+    finally:
+        log = server.stop()
+    assert "Traceback" not in log
+    assert "ERROR" not in log
+    assert "ready with table" in log
+    assert "Application shutdown complete" in log
+
+
+@pytest.mark.slow
+def test_several_workers_share_a_port(hall_table_path: Path):
+    server = ServerProcess(hall_table_path, workers=2)
+    try:
+        base_url = f"http://127.0.0.1:{server.port()}"
+        with httpx.Client(base_url=base_url, timeout=30, trust_env=False) as http:
+            server.wait_until_ready(http)
+        deadline = time.monotonic() + 100
+        while sum("ready with table" in line for line in server.log) < 2:
+            assert time.monotonic() < deadline, "".join(server.log)
+            time.sleep(0.05)
+        for _ in range(4):
+            with httpx.Client(base_url=base_url, timeout=30, trust_env=False) as http:
+                assert http.post("/v1/positions", json=REPORT).status_code == 200
+    finally:
+        log = server.stop()
+    assert "Traceback" not in log
+
+
+def test_what_cannot_be_served_is_said_first(hall_table_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(TableError, match="nowhere"):
+        serve(tmp_path / "nowhere.h5")
+    with pytest.raises(NotATableError):
+        serve(Path(__file__))
+    with pytest.raises(ServiceError, match="workers is 0; give at least 1"):
+        serve(hall_table_path, workers=0)
+    with pytest.raises(ServiceError, match="port is 70000; give one from 0 to 65535"):
+        serve(hall_table_path, port=70000)
+    with pytest.raises(ServiceError, match=r"'no\.such\.host\.invalid'.*127\.0\.0\.1"):
+        check_address("no.such.host.invalid", 8000)
+    with pytest.raises(ServiceError, match=r"192\.0\.2\.1"):  # an address kept for documentation
+        check_address("192.0.2.1", 8000)
+    monkeypatch.delenv(TABLE_VARIABLE, raising=False)
+    with pytest.raises(ServiceError, match=TABLE_VARIABLE):
+        app_from_environment()
+
+
+def test_a_free_port_is_free_again_after_the_check():
+    check_address("127.0.0.1", 0)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(ServiceError, match=str(port)):
+            check_address("127.0.0.1", port)
+    check_address("127.0.0.1", port)
+    check_address("127.0.0.1", port)
+
+
+def test_the_service_needs_no_offline_package():
+    code = (
+        "import sys\n"
+        "for name in ('trimesh', 'sklearn', 'embreex', 'joblib', 'rayfix', 'rayfix_offline'):\n"
+        "    sys.modules[name] = None\n"
+        "import rayfix_service.http.server\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

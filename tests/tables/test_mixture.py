@@ -1,0 +1,76 @@
+"""Mixtures of ray tubes: packing, slicing, types."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES, TubeMixture, pack, unpack
+
+shapes = st.lists(st.integers(0, 3), max_size=2).map(tuple)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_mixture(seed: int, count: int) -> TubeMixture:
+    """Numbers of no meaning in double precision."""
+    rng = np.random.default_rng(seed)
+    fields = {name: rng.normal(size=(count, *shape)) for name, shape in FIELD_SHAPES.items()}
+    fields["num_reflections"] = rng.integers(0, 9, count).astype(np.int8)
+    return TubeMixture(**fields)
+
+
+def test_packing_by_hand() -> None:
+    matrix = np.array([[1, 2, 3], [2, 4, 5], [3, 5, 6]])
+    np.testing.assert_array_equal(pack(matrix), [1, 2, 3, 4, 5, 6])
+    np.testing.assert_array_equal(unpack(np.arange(1, 7)), matrix)
+
+
+@given(seeds, shapes)
+def test_packing_is_undone(seed: int, shape: tuple[int, ...]) -> None:
+    packed = np.random.default_rng(seed).normal(size=(*shape, 6))
+    matrices = unpack(packed)
+    assert matrices.shape == (*shape, 3, 3)
+    np.testing.assert_array_equal(matrices, np.swapaxes(matrices, -1, -2))
+    np.testing.assert_array_equal(pack(matrices), packed)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_packing_keeps_the_type(dtype: type[np.generic]) -> None:
+    assert pack(np.zeros((2, 3, 3), dtype)).dtype == dtype
+    assert unpack(np.zeros((2, 6), dtype)).dtype == dtype
+
+
+@given(seeds, st.integers(0, 5), st.integers(0, 5))
+def test_concatenated_parts_come_back_as_slices(seed: int, first: int, second: int) -> None:
+    parts = [random_mixture(seed, first), random_mixture(seed + 1, second)]
+    whole = TubeMixture.concatenate(parts)
+    assert len(whole) == first + second
+    for part, again in zip(parts, (whole[:first], whole[first:]), strict=True):
+        for name in FIELD_SHAPES:
+            np.testing.assert_array_equal(getattr(again, name), getattr(part, name))
+
+
+def test_a_slice_is_a_view() -> None:
+    mixture = random_mixture(0, 4)
+    assert all(np.shares_memory(getattr(mixture[1:3], name), getattr(mixture, name)) for name in FIELD_SHAPES)
+
+
+def test_nothing_is_an_empty_mixture() -> None:
+    for mixture in (TubeMixture.empty(), TubeMixture.concatenate([])):
+        assert len(mixture) == 0
+        for name, shape in FIELD_SHAPES.items():
+            assert getattr(mixture, name).shape == (0, *shape)
+            assert getattr(mixture, name).dtype == FIELD_DTYPES[name]
+
+
+@given(seeds, st.integers(0, 5))
+def test_stored_types(seed: int, count: int) -> None:
+    """28 single-precision numbers and one small integer a component."""
+    mixture = random_mixture(seed, count)
+    stored = mixture.as_stored()
+    for name, shape in FIELD_SHAPES.items():
+        array = getattr(stored, name)
+        assert array.shape == (count, *shape)
+        assert array.flags.c_contiguous
+        np.testing.assert_array_equal(array, getattr(mixture, name).astype(FIELD_DTYPES[name]))
+    assert sum(getattr(stored, name).nbytes for name in FIELD_SHAPES) == count * (28 * 4 + 1)
