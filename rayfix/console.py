@@ -50,8 +50,10 @@ def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
 
 def print_build_summary(summary: "BuildSummary") -> None:
     """Print a line per station and one for the whole."""
-    grid = Grid("station", title=f"Table {summary.path}", title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("cells", "filled", "components", "MB", "lost rays"):
+    grid = Grid(
+        "station", title=f"Table {summary.path}", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1)
+    )
+    for heading in ("cells", "filled", "components", "MB", "lost"):
         grid.add_column(heading, justify="right")
     for k in range(max(len(s.coverage) for s in summary.stations)):
         grid.add_column(f"<= {k}", justify="right")
@@ -65,7 +67,7 @@ def print_build_summary(summary: "BuildSummary") -> None:
             f"{s.lost_ray_share:.3%}",
             *(f"{share:.0%}" for share in s.coverage),
         )
-    grid.caption = "filled: cells that rays come to; <= k: share of the free space reached with at most k reflections"
+    grid.caption = "filled: cells that rays come to; lost: rays that left the scene; <= k: share of the free space that at most k reflections reach"
     console = Console()
     console.print(grid)
     console.print(

@@ -18,13 +18,14 @@ def log_det(
 ) -> Any:
     """Logarithm of the determinant of a positive definite matrix, by Cholesky; ``scratch`` has its shape."""
     size = len(matrix)
-    total = 0.0
+    # One logarithm of the product: the pivots of covariances in metres and radians are far from overflow.
+    product = 1.0
     for j in range(size):
         pivot = matrix[j, j]
         for k in range(j):
             pivot -= scratch[j, k] * scratch[j, k]
         pivot = max(pivot, 1e-30)
-        total += np.log(pivot)
+        product *= pivot
         root = np.sqrt(pivot)
         scratch[j, j] = root
         for i in range(j + 1, size):
@@ -32,7 +33,7 @@ def log_det(
             for k in range(j):
                 value -= scratch[i, k] * scratch[j, k]
             scratch[i, j] = value / root
-    return total
+    return np.log(product)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,7 +1,7 @@
 """Moments of a cell's ray pieces, grouped by reflection sequence and slice.
 
 The joint vector is (path length, horizontal angle, vertical angle, x, y, z); the angles are tangent coordinates of the
-cell. Moments are taken about the group's own reference point, so that nothing large cancels.
+cell.
 """
 
 from typing import Any
@@ -9,8 +9,6 @@ from typing import Any
 import numba
 import numpy as np
 from numpy.typing import NDArray
-
-from rayfix_offline.pieces import FIRST_NODE
 
 SIZE = 6
 """Length of the joint vector."""
@@ -24,7 +22,8 @@ POSITION_FLOOR = 0.005
 LENGTH_FLOOR = 0.05
 """Standard deviation that every component has at least along its tube, m."""
 
-_KEY_STRIDE = 4096
+NUM_SUMS = 28
+"""Sums of a group: six of mass (1, a, a a), twelve of mass x length (1, a, d, d a), ten of mass x length^2 (1, d, d d)."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -46,17 +45,19 @@ def gather_groups(
     piece_variance: Any,
     images: Any,
     mirrors: Any,
-    log_ratio: Any,
     slots: Any,
 ) -> Any:
     """Add up the weighted moments of one cell.
+
+    Of a ray with launch direction d and tangent angles a, a piece of path length L lies at ``image + mirror @ (L d)``.
+    So the moments of (L, a, L d) are those of L times products of a and d, which are the same for all its pieces.
 
     Parameters
     ----------
     window : float, rad
         Standard deviation of the cell's window.
-    slots : ndarray of int64, shape (2**k,)
-        Scratch of a hash table, all -1; left so.
+    slots : ndarray of int32, shape (n_sequences, n_slices)
+        Scratch, all -1; left so.
 
     Returns
     -------
@@ -66,29 +67,18 @@ def gather_groups(
     cov : ndarray of shape (n_groups, 6, 6)
     """
     capacity = 64
-    keys = np.empty(capacity, np.int64)
-    places = np.empty(capacity, np.int64)
-    mass = np.zeros(capacity)
-    first = np.zeros((capacity, SIZE))
-    second = np.zeros((capacity, SIZE, SIZE))
-    references = np.zeros((capacity, 4))
+    keys = np.empty((capacity, 2), np.int64)
+    sums = np.zeros((capacity, NUM_SUMS))
     count = 0
-    num_slots = len(slots)
-
-    centre = np.array(
-        [
-            np.sin(centre_zenith) * np.cos(centre_azimuth),
-            np.sin(centre_zenith) * np.sin(centre_azimuth),
-            np.cos(centre_zenith),
-        ]
-    )
+    constant = np.empty(NUM_SUMS)
+    constant[0] = 1.0
+    constant[6] = 1.0
+    constant[18] = 1.0
     sine = np.sin(centre_zenith)
     reach = CUTOFF * window
     num_rings = len(ring_cells)
     first_ring = max(0, int((centre_zenith - reach) / np.pi * num_rings))
     last_ring = min(num_rings - 1, int((centre_zenith + reach) / np.pi * num_rings))
-    delta = np.empty(SIZE)
-    heading = np.empty(3)
     for ring in range(first_ring, last_ring + 1):
         cells = ring_cells[ring]
         half = reach / sine / (2.0 * np.pi) * cells
@@ -107,80 +97,108 @@ def gather_groups(
             if square > CUTOFF * CUTOFF:
                 continue
             density = np.exp(-0.5 * square) / (2.0 * np.pi * window * window) * solid_angle[ray]
+            _products(horizontal, vertical, directions[ray], constant)
             for piece in range(piece_offsets[ray], piece_offsets[ray + 1]):
-                if piece_mass[piece] <= 0.0:
+                mass = density * piece_mass[piece]
+                if mass <= 0.0:
                     continue
-                seq = piece_sequence[piece]
-                key = np.int64(seq) * _KEY_STRIDE + piece_slice[piece]
-                slot = (key * np.int64(2654435761)) % num_slots
-                while slots[slot] >= 0 and keys[slots[slot]] != key:
-                    slot = (slot + 1) % num_slots
-                group = slots[slot]
+                group = slots[piece_sequence[piece], piece_slice[piece]]
                 if group < 0:
-                    if 2 * count >= num_slots:
-                        # The table is full: what comes last is the least of a cell with tens of thousands of groups.
-                        continue
                     if count == capacity:
                         capacity *= 2
                         keys = _grown(keys, capacity)
-                        places = _grown(places, capacity)
-                        mass = _grown(mass, capacity)
-                        first = _grown(first, capacity)
-                        second = _grown(second, capacity)
-                        references = _grown(references, capacity)
+                        sums = _grown(sums, capacity)
                     group = count
                     count += 1
-                    slots[slot] = group
-                    keys[group] = key
-                    places[group] = slot
-                    length = FIRST_NODE * np.exp(piece_slice[piece] * log_ratio)
-                    references[group, 0] = length
-                    for i in range(3):
-                        references[group, 1 + i] = images[seq, i] + length * (
-                            mirrors[seq, i, 0] * centre[0]
-                            + mirrors[seq, i, 1] * centre[1]
-                            + mirrors[seq, i, 2] * centre[2]
-                        )
-                for i in range(3):
-                    heading[i] = (
-                        mirrors[seq, i, 0] * directions[ray, 0]
-                        + mirrors[seq, i, 1] * directions[ray, 1]
-                        + mirrors[seq, i, 2] * directions[ray, 2]
-                    )
-                weight = density * piece_mass[piece]
-                mean, variance = piece_mean[piece], piece_variance[piece]
-                delta[0] = mean - references[group, 0]
-                delta[1] = horizontal
-                delta[2] = vertical
-                for i in range(3):
-                    delta[3 + i] = images[seq, i] + mean * heading[i] - references[group, 1 + i]
-                mass[group] += weight
-                for i in range(SIZE):
-                    first[group, i] += weight * delta[i]
-                    for j in range(i, SIZE):
-                        second[group, i, j] += weight * delta[i] * delta[j]
-                second[group, 0, 0] += weight * variance
-                for i in range(3):
-                    second[group, 0, 3 + i] += weight * variance * heading[i]
-                    for j in range(i, 3):
-                        second[group, 3 + i, 3 + j] += weight * variance * heading[i] * heading[j]
+                    slots[piece_sequence[piece], piece_slice[piece]] = group
+                    keys[group, 0] = piece_sequence[piece]
+                    keys[group, 1] = piece_slice[piece]
+                once = mass * piece_mean[piece]
+                twice = mass * (piece_variance[piece] + piece_mean[piece] * piece_mean[piece])
+                row = sums[group]
+                for i in range(6):
+                    row[i] += mass * constant[i]
+                for i in range(6, 18):
+                    row[i] += once * constant[i]
+                for i in range(18, NUM_SUMS):
+                    row[i] += twice * constant[i]
 
-    sequence = np.empty(count, np.int64)
+    masses = np.empty(count)
     means = np.empty((count, SIZE))
+    covs = np.empty((count, SIZE, SIZE))
     for group in range(count):
-        slots[places[group]] = -1
-        sequence[group] = keys[group] // _KEY_STRIDE
-        for i in range(SIZE):
-            first[group, i] /= mass[group]
-            means[group, i] = first[group, i]
-        means[group, 0] += references[group, 0]
-        for i in range(3):
-            means[group, 3 + i] += references[group, 1 + i]
-        for i in range(SIZE):
-            for j in range(i, SIZE):
-                second[group, i, j] = second[group, i, j] / mass[group] - first[group, i] * first[group, j]
-                second[group, j, i] = second[group, i, j]
-    return sequence, mass[:count], means, second[:count]
+        slots[keys[group, 0], keys[group, 1]] = -1
+        masses[group] = sums[group, 0]
+        _to_moments(sums[group], images[keys[group, 0]], mirrors[keys[group, 0]], means[group], covs[group])
+    return keys[:count, 0], masses, means, covs
+
+
+@numba.njit(cache=True, nogil=True)
+def _products(horizontal: Any, vertical: Any, heading: Any, out: Any) -> None:
+    """Fill in what a ray's pieces are multiplied by: products of a and d, by the power of the length they go with."""
+    out[1] = horizontal
+    out[2] = vertical
+    out[3] = horizontal * horizontal
+    out[4] = horizontal * vertical
+    out[5] = vertical * vertical
+    out[7] = horizontal
+    out[8] = vertical
+    place = 21 + 1
+    for i in range(3):
+        out[9 + i] = heading[i]
+        out[12 + i] = heading[i] * horizontal
+        out[15 + i] = heading[i] * vertical
+        out[19 + i] = heading[i]
+        for j in range(i, 3):
+            out[place] = heading[i] * heading[j]
+            place += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_moments(sums: Any, image: Any, mirror: Any, mean: Any, cov: Any) -> None:
+    """Turn the sums of a group into the mean and covariance of (L, a, x)."""
+    raw = np.empty((SIZE, SIZE))
+    first = np.empty(SIZE)
+    mass = sums[0]
+    first[0] = sums[6] / mass
+    first[1] = sums[1] / mass
+    first[2] = sums[2] / mass
+    raw[0, 0] = sums[18] / mass
+    raw[0, 1] = sums[7] / mass
+    raw[0, 2] = sums[8] / mass
+    raw[1, 1] = sums[3] / mass
+    raw[1, 2] = sums[4] / mass
+    raw[2, 2] = sums[5] / mass
+    place = 21 + 1
+    for i in range(3):
+        first[3 + i] = sums[9 + i] / mass
+        raw[1, 3 + i] = sums[12 + i] / mass
+        raw[2, 3 + i] = sums[15 + i] / mass
+        raw[0, 3 + i] = sums[19 + i] / mass
+        for j in range(i, 3):
+            raw[3 + i, 3 + j] = sums[place] / mass
+            place += 1
+    for i in range(SIZE):
+        for j in range(i, SIZE):
+            raw[i, j] -= first[i] * first[j]
+            raw[j, i] = raw[i, j]
+    # From the unfolded position L d to the real one, x = image + mirror @ (L d).
+    for i in range(3):
+        mean[i] = first[i]
+        mean[3 + i] = image[i]
+        for j in range(3):
+            cov[i, j] = raw[i, j]
+            mean[3 + i] += mirror[i, j] * first[3 + j]
+            cov[3 + i, j] = mirror[i, 0] * raw[3, j] + mirror[i, 1] * raw[4, j] + mirror[i, 2] * raw[5, j]
+            cov[j, 3 + i] = cov[3 + i, j]
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                total += mirror[j, k] * (
+                    mirror[i, 0] * raw[3, 3 + k] + mirror[i, 1] * raw[4, 3 + k] + mirror[i, 2] * raw[5, 3 + k]
+                )
+            cov[3 + i, 3 + j] = total
 
 
 @numba.njit(cache=True, nogil=True)
@@ -248,6 +266,6 @@ def _grown(
     return larger
 
 
-def new_slots(bits: int = 16) -> NDArray[np.int64]:
+def new_slots(num_sequences: int, num_slices: int) -> NDArray[np.int32]:
     """Scratch for :func:`gather_groups`."""
-    return np.full(2**bits, -1, np.int64)
+    return np.full((num_sequences, num_slices), -1, np.int32)

@@ -43,6 +43,11 @@ class Pieces:
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
 
+    @property
+    def num_slices(self) -> int:
+        """Number of slices that occur, counted from the station."""
+        return int(self.slice.max(initial=-1)) + 1
+
     def of_rays(self, index: NDArray[np.int64]) -> "Pieces":
         """Pieces of chosen rays, in the order of ``index``."""
         counts = self.offsets[index + 1] - self.offsets[index]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.merge import merge_runnalls
 from rayfix_offline.moments import blur, gather_groups, new_slots
-from rayfix_offline.trace import SLICE_RATIO, LevelRays
+from rayfix_offline.trace import LevelRays
 from rayfix_tables.mixture import TubeMixture, pack
 
 
@@ -30,7 +30,7 @@ class TubeFit:
     """
 
     dropped_mass: float = 1e-4
-    max_groups: int = 400
+    max_groups: int = 250
     max_components: int = 48
     max_divergence: float = 1e-3
 
@@ -72,13 +72,12 @@ def fit_tubes(
         pieces.variance,
         sequences.images,
         sequences.mirrors,
-        np.log(SLICE_RATIO),
         level.ray_spacing,
         fit.dropped_mass,
         fit.max_groups,
         fit.max_components,
         fit.max_divergence,
-        new_slots(),
+        new_slots(len(sequences.images), pieces.num_slices),
     )
     return counts, log_mass, joint_to_tubes(log_weight, mean, cov, sequences.num_reflections[label])
 
@@ -128,7 +127,6 @@ def _fit_block(
     piece_variance: Any,
     images: Any,
     mirrors: Any,
-    log_ratio: Any,
     ray_spacing: Any,
     dropped_mass: Any,
     max_groups: Any,
@@ -163,7 +161,6 @@ def _fit_block(
             piece_variance,
             images,
             mirrors,
-            log_ratio,
             slots,
         )
         whole = mass.sum()

@@ -1,4 +1,4 @@
-"""A UE in the bundled hall that no station sees: where it is, and the report that it causes."""
+"""A UE in the bundled hall that one station sees and three hear by reflection: its place and the report it causes."""
 
 import json
 from typing import Any
@@ -9,7 +9,7 @@ from rayfix.evaluation.forward import ForwardSolver, Paths
 from rayfix.evaluation.simulate import Noise, simulate_report
 from rayfix.example.hall import hall_scene, hall_stations
 
-EXAMPLE_POSITION = (5.53, 7.27, 1.05)
+EXAMPLE_POSITION = (5.32, 14.2, 0.67)
 """Position of the UE, m."""
 
 EXAMPLE_NOISE = Noise(azimuth_stdev=np.deg2rad(1.0), zenith_stdev=np.deg2rad(1.0), range_stdev=0.5)

@@ -1,7 +1,7 @@
 """The bundled example: a small production hall full of machines, racks and shelves.
 
 The hall measures 8 x 18 x 2.5 m and has one station in each top corner. Its clutter is inspired by the indoor
-industrial scenario of 5G-ACIA (machines, racks and shelves up to just below the ceiling); two thirds of the
+industrial scenario of 5G-ACIA (machines, racks and shelves, some up to just below the ceiling); almost two thirds of the
 station-to-position pairs have no line of sight.
 """
 
@@ -39,14 +39,14 @@ def hall_boxes() -> list[Box]:
     """Solids of the hall's clutter: machines, cabinets, racks, a conveyor and two pillars."""
     boxes: list[Box] = []
     machines = [
-        ((1.1, 1.6), (2.5, 3.0), 2.1),
-        ((5.0, 1.3), (6.4, 2.4), 1.9),
-        ((5.6, 4.4), (6.8, 5.9), 2.2),
-        ((1.0, 5.3), (2.2, 6.7), 2.0),
-        ((1.1, 11.2), (2.4, 12.4), 2.2),
-        ((5.4, 11.7), (6.7, 13.0), 2.0),
-        ((1.4, 15.1), (2.7, 16.3), 1.9),
-        ((5.2, 15.3), (6.5, 16.5), 2.2),
+        ((1.2, 1.2), (2.6, 2.6), 2.0),
+        ((4.8, 1.4), (6.2, 2.5), 2.2),
+        ((5.3, 4.6), (6.5, 6.1), 2.2),
+        ((0.8, 5.7), (2.0, 7.1), 2.3),
+        ((0.5, 10.7), (1.8, 11.9), 2.1),
+        ((5.8, 12.3), (7.1, 13.6), 2.1),
+        ((1.9, 15.9), (3.2, 17.1), 2.0),
+        ((5.9, 15.9), (7.2, 17.1), 2.1),
     ]
     for i, ((x0, y0), (x1, y1), height) in enumerate(machines, start=1):
         boxes.append(Box(name=f"machine_{i}", material="metal", low=(x0, y0, 0.0), high=(x1, y1, height)))
@@ -59,10 +59,10 @@ def hall_boxes() -> list[Box]:
                 high=(x1 + 0.41, y0 + 0.8, 1.6),
             )
         )
-    boxes.extend(_rack("rack_1", (3.55, 3.9), (4.25, 6.9)))
-    boxes.extend(_rack("rack_2", (3.6, 10.9), (4.3, 13.9)))
-    boxes.extend(_rack("rack_3", (1.2, 8.5), (3.3, 9.1)))
-    boxes.extend(_rack("rack_4", (4.6, 8.7), (6.7, 9.3)))
+    boxes.extend(_rack("rack_1", (3.75, 4.1), (4.45, 7.1)))
+    boxes.extend(_rack("rack_2", (3.0, 10.7), (3.7, 13.7)))
+    boxes.extend(_rack("rack_3", (0.9, 8.9), (3.0, 9.5)))
+    boxes.extend(_rack("rack_4", (5.3, 8.0), (7.4, 8.6)))
     boxes.append(Box(name="conveyor", material="metal", low=(3.9, 15.2, 0.0), high=(4.5, 17.0, 0.9)))
     boxes.append(Box(name="pillar_1", material="concrete", low=(3.7, 7.7, 0.0), high=(4.1, 8.1, 2.5)))
     boxes.append(Box(name="pillar_2", material="concrete", low=(3.8, 14.2, 0.0), high=(4.2, 14.6, 2.5)))
@@ -104,7 +104,7 @@ def _rack(name: str, low: tuple[float, float], high: tuple[float, float]) -> lis
     """Build a rack: two end panels, four boards, and goods on the boards with gaps between them."""
     (x0, y0), (x1, y1) = low, high
     along_x = x1 - x0 > y1 - y0
-    height, thickness = 2.1, 0.04
+    height, thickness = 2.25, 0.04
     start, end = (x0, x1) if along_x else (y0, y1)
 
     def span(a: float, b: float, z0: float, z1: float, part: str, material: str, inset: float = 0.0) -> Box:
@@ -116,7 +116,7 @@ def _rack(name: str, low: tuple[float, float], high: tuple[float, float]) -> lis
         span(start, start + thickness, 0.0, height, "end_1", "metal"),
         span(end - thickness, end, 0.0, height, "end_2", "metal"),
     ]
-    levels = [0.05, 0.75, 1.4, height - thickness]
+    levels = [0.05, 0.8, 1.5, height - thickness]
     inner_start, inner_end = start + thickness, end - thickness
     for i, z in enumerate(levels):
         boxes.append(span(inner_start, inner_end, z, z + thickness, f"board_{i + 1}", "metal"))
@@ -132,7 +132,7 @@ def _rack(name: str, low: tuple[float, float], high: tuple[float, float]) -> lis
                     a + 0.03,
                     a + width - 0.03,
                     z + thickness,
-                    z + 0.6,
+                    z + 0.64,
                     f"goods_{i + 1}{j + 1}",
                     "wood",
                     inset=0.04,

@@ -1,6 +1,9 @@
 """Read table files. The arrays are mapped, not read: workers that serve one table share its pages."""
 
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,14 +123,8 @@ class Table:
             When it is truncated or a part is missing.
         """
         path = Path(path)
-        with _open_file(path) as file:
-            mapped = np.memmap(path, dtype=np.uint8, mode="r")
-            try:
-                return cls._read(path, file, mapped)
-            except (KeyError, ValueError, json.JSONDecodeError) as error:
-                raise CorruptTableError(
-                    f"{path} is damaged ({_one_line(error)}); restore it from a copy or build it again"
-                ) from error
+        with _damage_reported(path), _open_file(path) as file:
+            return cls._read(path, file, np.memmap(path, dtype=np.uint8, mode="r"))
 
     @classmethod
     def _read(cls, path: Path, file: h5py.File, mapped: NDArray[np.uint8]) -> "Table":
@@ -178,38 +175,48 @@ class Table:
         CorruptTableError
             When a dataset or the ``table_id`` does not match.
         """
-        with _open_file(self.path) as file:
+        with _damage_reported(self.path), _open_file(self.path) as file:
             digests: dict[str, str] = {}
             for name in dataset_paths(file):
-                try:
-                    digests[name] = array_digest(file[name][()])
-                except OSError as error:
-                    raise CorruptTableError(
-                        f"{self.path}: {name} cannot be read; restore the table from a copy or build it again"
-                    ) from error
+                digests[name] = array_digest(file[name][()])
                 if digests[name] != str(file[name].attrs.get("sha256")):
-                    raise CorruptTableError(
-                        f"{self.path}: the checksum of {name} does not match; restore the table from a copy or "
-                        "build it again"
-                    )
+                    raise ValueError(f"the checksum of {name} does not match")
             if content_id(content_attributes(file), digests) != str(file.attrs["table_id"]):
-                raise CorruptTableError(
-                    f"{self.path}: the table_id does not match the content; restore the table from a copy or "
-                    "build it again"
-                )
+                raise ValueError("the table_id does not match the content")
+
+
+@contextmanager
+def _damage_reported(path: Path) -> Iterator[None]:
+    """Say in one line what the readers make of a damaged file.
+
+    A byte changed among the file's own administration shows as any of these: HDF5 raises OSError, KeyError or
+    RuntimeError, and what it reads nevertheless may have any type.
+    """
+    try:
+        yield
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        MemoryError,
+        OSError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+    ) as error:
+        raise CorruptTableError(
+            f"{path} is damaged: {_one_line(error)}; restore it from a copy or build it again"
+        ) from error
 
 
 def _open_file(path: Path) -> h5py.File:
     if not path.exists():
         raise TableError(f"there is no table at {path}; build one with 'rayfix build SITE.toml -o {path}'")
+    if not os.access(path, os.R_OK):
+        raise TableError(f"{path} cannot be read; ask its owner for the right to read it")
     if path.is_dir() or not h5py.is_hdf5(path):
         raise NotATableError(f"{path} is not a rayfix table (not an HDF5 file); give a file that 'rayfix build' wrote")
-    try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        raise CorruptTableError(
-            f"{path} is truncated or damaged ({_one_line(error)}); restore it from a copy or build it again"
-        ) from error
+    file = h5py.File(path, "r")
     if file.attrs.get("format") != FORMAT:
         file.close()
         raise NotATableError(f"{path} is an HDF5 file but not a rayfix table; give a file that 'rayfix build' wrote")
@@ -241,8 +248,14 @@ def _read_level(group: h5py.Group, mapped: NDArray[np.uint8]) -> Level:
     arrays = {name: _map(group[name], kind, mapped) for name, kind in LEVEL_DATASETS.items()}
     grid = AngularGrid(ring_cells=np.array(arrays["ring_cells"]))
     mixture = TubeMixture(**{name: arrays[name] for name in FIELD_SHAPES})
-    if len(arrays["cell_offsets"]) != grid.num_cells + 1 or arrays["cell_offsets"][-1] != len(mixture):
-        raise ValueError(f"{group.name}: cell_offsets do not fit the grid")
+    shapes = {name: (len(mixture), *shape) for name, shape in FIELD_SHAPES.items()}
+    shapes |= {"cell_offsets": (grid.num_cells + 1,), "cell_log_mass": (grid.num_cells,)}
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"{group.name}/{name} has the shape {arrays[name].shape}, not {shape}")
+    steps = np.diff(arrays["cell_offsets"], prepend=0, append=len(mixture))
+    if steps[0] != 0 or steps[-1] != 0 or np.any(steps < 0):
+        raise ValueError(f"{group.name}/cell_offsets do not run from 0 to {len(mixture)}")
     return Level(
         window=float(np.deg2rad(group.attrs["window_deg"])),
         grid=grid,

@@ -1,5 +1,6 @@
 """Write table files: beside the final name, checksummed, synced, then renamed into place."""
 
+import io
 import json
 import os
 from collections.abc import Sequence
@@ -133,27 +134,28 @@ def write_table(
     """
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
-        with h5py.File(partial, "w", alignment_threshold=1, alignment_interval=64) as file:
-            _write_scene(file, scene)
-            for station, content in zip(site.stations, stations, strict=True):
-                group = file.create_group(f"stations/{station.id}")
-                group.attrs["position_m"] = np.asarray(station.position)
-                group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
-                group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
-                group.attrs["lost_ray_share"] = content.lost_ray_share
-                group.attrs["coverage"] = np.asarray(content.coverage)
-                for n, level in enumerate(content.levels):
-                    _write_level(file.create_group(level_path(station.id, n)), level)
-            file.attrs["format"] = FORMAT
-            file.attrs["format_version"] = FORMAT_VERSION
-            file.attrs["software_version"] = software_version
-            file.attrs["scene_sha256"] = scene.sha256
-            file.attrs["site"] = json.dumps(_site_document(site), sort_keys=True)
-            digests = {name: str(file[name].attrs["sha256"]) for name in dataset_paths(file)}
-            table_id = content_id(content_attributes(file), digests)
-            file.attrs["table_id"] = table_id
-        with partial.open("rb") as handle:
-            os.fsync(handle.fileno())
+        with _Sink(partial, "w+") as sink:
+            with h5py.File(sink, "w", alignment_threshold=1, alignment_interval=64) as file:
+                _write_scene(file, scene)
+                for station, content in zip(site.stations, stations, strict=True):
+                    group = file.create_group(f"stations/{station.id}")
+                    group.attrs["position_m"] = np.asarray(station.position)
+                    group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
+                    group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
+                    group.attrs["lost_ray_share"] = content.lost_ray_share
+                    group.attrs["coverage"] = np.asarray(content.coverage)
+                    for n, level in enumerate(content.levels):
+                        _write_level(file.create_group(level_path(station.id, n)), level)
+                file.attrs["format"] = FORMAT
+                file.attrs["format_version"] = FORMAT_VERSION
+                file.attrs["software_version"] = software_version
+                file.attrs["scene_sha256"] = scene.sha256
+                file.attrs["site"] = json.dumps(_site_document(site), sort_keys=True)
+                digests = {name: str(file[name].attrs["sha256"]) for name in dataset_paths(file)}
+                table_id = content_id(content_attributes(file), digests)
+                file.attrs["table_id"] = table_id
+            sink.raise_failure()
+            os.fsync(sink.fileno())
         partial.replace(path)
         folder = os.open(path.parent, os.O_RDONLY)
         try:
@@ -167,6 +169,41 @@ def write_table(
     finally:
         partial.unlink(missing_ok=True)
     return table_id
+
+
+class _Sink(io.FileIO):
+    """File whose writes never fail as HDF5 sees it.
+
+    HDF5 crashes the process, or prints tracebacks when it ends, after a write that failed (a full disk). So the first
+    failure, or Ctrl-C, is kept, nothing more is written, and the failure is raised when HDF5 is done.
+    """
+
+    _failure: BaseException | None = None
+
+    def write(self, data: Any, /) -> int:
+        """Write all of it."""
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        try:
+            while rest and self._failure is None:
+                rest = rest[super().write(rest) :]
+        except BaseException as error:
+            self._failure = error
+        return size
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Change the file's size."""
+        try:
+            if self._failure is None:
+                super().truncate(size)
+        except BaseException as error:
+            self._failure = error
+        return size or 0
+
+    def raise_failure(self) -> None:
+        """Raise the first failure."""
+        if self._failure is not None:
+            raise self._failure
 
 
 def _write_scene(file: h5py.File, scene: SceneContent) -> None:

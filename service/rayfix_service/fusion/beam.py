@@ -23,7 +23,7 @@ class Hypotheses:
     outlier : ndarray of int8, shape (h, n_factors)
         What the hypothesis takes for an outlier in each factor.
     log_lost : float
-        Log evidence of the hypothesis that all factors are outliers.
+        Log evidence of the hypothesis that all factors are outliers, which is none of the above.
     """
 
     log_weight: NDArray[np.float64]
@@ -31,6 +31,10 @@ class Hypotheses:
     cov: NDArray[np.float64]
     outlier: NDArray[np.int8]
     log_lost: float
+
+    def __len__(self) -> int:
+        """Return the number of hypotheses."""
+        return len(self.log_weight)
 
 
 def multiply(
@@ -43,38 +47,49 @@ def multiply(
     factors : sequence of Factor
         At least one.
     max_path_length : float, m
-        Standard deviation of the prior of the clocks' offsets.
+        What the prior density of a clock's offset is the inverse of, wherever the offset is.
     width : int
         Hypotheses that are kept after each factor.
     """
     dimension = 3 + num_clocks
+    log_range = float(np.log(max_path_length))
     information = np.zeros((1, dimension, dimension))
-    for clock in range(3, dimension):
-        information[0, clock, clock] = max_path_length**-2
     eta = np.zeros((1, dimension))
-    log_scale = np.full(1, -num_clocks * (0.5 * np.log(2.0 * np.pi) + np.log(max_path_length)) - log_volume)
-    # Few alternatives first: they cut the beam before it meets the many.
-    order = sorted(range(len(factors)), key=lambda i: len(factors[i]))
+    log_scale = np.full(1, -num_clocks * log_range - log_volume)
     chosen = np.zeros((1, len(factors)), np.int8)
     score = np.zeros(1)
-    for i in order:
+    # Few alternatives first: they cut the beam before it meets the many. Which of two alike comes first must not
+    # depend on the report's order.
+    for i in sorted(range(len(factors)), key=lambda i: (len(factors[i]), factors[i].log_scale.max())):
         factor = factors[i]
         parent, choice, score = extend_beam(
-            information, eta, log_scale, factor.information, factor.eta, factor.log_scale, width, log_volume
+            information,
+            eta,
+            log_scale,
+            factor.information,
+            factor.eta,
+            factor.log_scale,
+            width,
+            log_volume,
+            log_range,
         )
         information = information[parent] + factor.information[choice]
         eta = eta[parent] + factor.eta[choice]
         log_scale = log_scale[parent] + factor.log_scale[choice]
         chosen = chosen[parent]
         chosen[:, i] = factor.outlier[choice]
-    placed = np.trace(information[:, :3, :3], axis1=1, axis2=2) > 0.0
-    cov = np.linalg.inv(information[placed])
-    mean = np.einsum("hij,hj->hi", cov, eta[placed])
-    log_lost = sum(float(f.log_scale[f.outlier == ALL_OUTLIER][0]) for f in factors)
+    placed = (information[:, 0, 0] > 0.0) & (score > -np.inf)
+    information, eta = information[placed], eta[placed]
+    for clock in range(3, dimension):
+        # Of a clock that nothing constrains only this entry is not zero; it changes nothing else.
+        information[information[:, clock, clock] <= 0.0, clock, clock] = 1.0
+    cov = np.linalg.inv(information)
+    cov = 0.5 * (cov + cov.transpose(0, 2, 1))
+    mean = (cov @ eta[:, :, None])[:, :, 0]
     return Hypotheses(
         log_weight=score[placed],
         mean=mean[:, :3],
         cov=cov[:, :3, :3],
         outlier=chosen[placed],
-        log_lost=log_lost,
+        log_lost=sum(float(f.log_scale[f.outlier == ALL_OUTLIER][0]) for f in factors),
     )

@@ -1,5 +1,6 @@
 """Turn an observation into a factor: alternatives for what the measured path may be."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,101 +53,86 @@ def make_factor(
     Parameters
     ----------
     max_path_length : float, m
-        A time that is an outlier may be anything up to this.
+        A time that is an outlier may be anything up to this, and noise.
     log_volume : float
         Natural logarithm of the free space's volume [m3].
     """
-    dimension = 3 + num_clocks
     log_evidence, mean, cov = _condition(look_up(part.levels, observation.direction))
     if not len(log_evidence):
         return None
-    has_angle = observation.angle_index is not None
-    num_times = len(observation.lengths) + len(observation.readings)
-    log_good, log_bad = np.log1p(-settings.outlier_probability), np.log(settings.outlier_probability)
-    log_any_time = -num_times * np.log(max_path_length)
-    parts: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], int]] = []
-    if has_angle and num_times:
-        parts.append((log_evidence + log_good + log_bad + log_any_time, mean, cov, TIME_OUTLIER))
-        log_evidence = log_evidence + 2.0 * log_good
-        mean, cov = mean.copy(), cov.copy()
+    readings = observation.readings
+    variances = [*(variance for _, variance in observation.lengths), *(r.variance for r in readings)]
+    # Noise counts, so that a measurement with very much of it does not look like an outlier.
+    log_any_time = -sum(math.log(max_path_length + math.sqrt(2.0 * math.pi * v)) for v in variances)
+    log_good, log_bad = math.log1p(-settings.outlier_probability), math.log(settings.outlier_probability)
+    log_outlier = log_bad + log_any_time - _log_angle_range(observation)
+    # Readings are not in the evidence yet; what each clock will cost, whatever it shows, is its even prior.
+    log_clocks = -len({reading.clock for reading in readings}) * math.log(max_path_length)
+    parts = []
+    if observation.angle_index is not None and variances:
+        parts.append((TIME_OUTLIER, log_evidence + (log_good + log_bad + log_any_time), mean, cov, 0.0))
+        log_evidence, mean, cov = log_evidence + 2.0 * log_good, mean.copy(), cov.copy()
     else:
-        log_evidence = log_evidence + log_good
+        log_evidence += log_good
     for length, variance in observation.lengths:
         condition_on_length(log_evidence, mean, cov, length, variance)
-    parts.insert(0, (log_evidence, mean, cov, ALL_GOOD))
-    log_outlier = log_bad + log_any_time - _log_angle_range(observation)
-    top = max(log_outlier + log_volume, *(float(p[0].max()) for p in parts))
-    floor = top + np.log(settings.component_floor)
-    pieces = [_to_information(*p, observation, dimension, floor) for p in parts]
-    return Factor(
-        information=np.concatenate([*(p.information for p in pieces), np.zeros((1, dimension, dimension))]),
-        eta=np.concatenate([*(p.eta for p in pieces), np.zeros((1, dimension))]),
-        log_scale=np.concatenate([*(p.log_scale for p in pieces), [log_outlier]]),
-        outlier=np.concatenate([*(p.outlier for p in pieces), [np.int8(ALL_OUTLIER)]]),
-    )
+    parts.insert(0, (ALL_GOOD, log_evidence, mean, cov, log_clocks))
+    top = max(log_outlier + log_volume, *(float(log.max()) + cost for _, log, _, _, cost in parts))
+    floor = top + math.log(settings.component_floor)
+    keeps = [np.flatnonzero(log > floor - cost) for _, log, _, _, cost in parts]
+    total, dimension = sum(len(keep) for keep in keeps) + 1, 3 + num_clocks
+    information = np.zeros((total, dimension, dimension))
+    eta, log_scale = np.zeros((total, dimension)), np.full(total, log_outlier)
+    outlier = np.full(total, ALL_OUTLIER, np.int8)
+    begin = 0
+    for keep, (kind, log, m, c, _) in zip(keeps, parts, strict=True):
+        taken = readings if kind == ALL_GOOD else ()
+        out = slice(begin, begin + len(keep))
+        to_information(
+            keep,
+            log,
+            m,
+            c,
+            np.array([r.clock for r in taken], np.int64),
+            np.array([r.offset for r in taken], np.float64),
+            np.array([r.variance for r in taken], np.float64),
+            information[out],
+            eta[out],
+            log_scale[out],
+        )
+        outlier[out] = kind
+        begin = out.stop
+    return Factor(information=information, eta=eta, log_scale=log_scale, outlier=outlier)
 
 
 def _condition(lookup: Lookup) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Log evidence, mean and covariance of (x, path length) of every component of the cells looked up."""
     level = lookup.level
-    begins = level.cell_offsets[lookup.cells]
-    ends = level.cell_offsets[lookup.cells + 1]
-    places = np.concatenate([[0], np.cumsum(ends - begins)])
-    total = int(places[-1])
+    begins, ends = level.cell_offsets[lookup.cells], level.cell_offsets[lookup.cells + 1]
+    total = int((ends - begins).sum())
     log_evidence, mean, cov = np.empty(total), np.empty((total, 4)), np.empty((total, 4, 4))
     mixture = level.mixture
-    for n in range(len(lookup.cells)):
-        a, b = int(begins[n]), int(ends[n])
-        if a == b:
-            continue
-        out = slice(int(places[n]), int(places[n + 1]))
-        condition_on_angle(
-            mixture.log_weight[a:b],
-            mixture.u_mean[a:b],
-            mixture.u_cov[a:b],
-            mixture.x_mean[a:b],
-            mixture.jacobian[a:b],
-            mixture.x_cov[a:b],
-            lookup.rest_mean[n],
-            lookup.rest_cov[n],
-            lookup.log_factor[n] + level.cell_log_mass[lookup.cells[n]],
-            log_evidence[out],
-            mean[out],
-            cov[out],
-        )
-    return log_evidence, mean, cov
-
-
-def _to_information(
-    log_evidence: NDArray[np.float64],
-    mean: NDArray[np.float64],
-    cov: NDArray[np.float64],
-    outlier: int,
-    observation: Observation,
-    dimension: int,
-    floor: float,
-) -> Factor:
-    keep = np.flatnonzero(log_evidence > floor)
-    readings = observation.readings if outlier == ALL_GOOD else ()
-    information = np.empty((len(keep), dimension, dimension))
-    eta, log_scale = np.empty((len(keep), dimension)), np.empty(len(keep))
-    to_information(
-        log_evidence[keep],
-        mean[keep],
-        cov[keep],
-        np.array([r.clock for r in readings], np.int64),
-        np.array([r.offset for r in readings], np.float64),
-        np.array([r.variance for r in readings], np.float64),
-        dimension,
-        information,
-        eta,
-        log_scale,
+    condition_on_angle(
+        mixture.log_weight,
+        mixture.u_mean,
+        mixture.u_cov,
+        mixture.x_mean,
+        mixture.jacobian,
+        mixture.x_cov,
+        begins,
+        ends,
+        lookup.rest_mean,
+        lookup.rest_cov,
+        lookup.log_factor + level.cell_log_mass[lookup.cells],
+        log_evidence,
+        mean,
+        cov,
     )
-    return Factor(information=information, eta=eta, log_scale=log_scale, outlier=np.full(len(keep), outlier, np.int8))
+    return log_evidence, mean, cov
 
 
 def _log_angle_range(observation: Observation) -> float:
     """Logarithm of the range over which an angle that is an outlier is spread evenly, in the units of the factor."""
     if observation.angle_index is None:
         return 0.0
-    return float(np.log(2.0 * np.pi if observation.direction.zenith is None else 4.0 * np.pi))
+    return math.log(2.0 * math.pi if observation.direction.zenith is None else 4.0 * math.pi)

@@ -1,7 +1,9 @@
-"""Compiled kernels of the fusion. :mod:`rayfix_service.fusion.reference` holds their plain NumPy twins.
+"""Compiled kernels of the fusion's products. :mod:`rayfix_service.fusion.reference` holds their plain NumPy twins.
 
 A *factor* is what one path of the report says of the state ``z = (x, clock offsets)``: an alternative of it is
-``exp(log_scale + eta . z - z . information . z / 2)``, for one component of the table's cell.
+``exp(log_scale + eta . z - z . information . z / 2)``, for one component of the table's cell. An alternative that says
+nothing of the position is constant over the whole free space, and says nothing of the clocks either; one that says
+nothing of a clock is constant over the clock's range.
 """
 
 from typing import Any
@@ -20,6 +22,8 @@ def condition_on_angle(
     x_mean: Any,
     jacobian: Any,
     x_cov: Any,
+    begins: Any,
+    ends: Any,
     rest_mean: Any,
     rest_cov: Any,
     log_factor: Any,
@@ -27,85 +31,84 @@ def condition_on_angle(
     out_mean: Any,
     out_cov: Any,
 ) -> None:
-    """Condition a cell's components on the rest of the measured angle.
+    """Condition the components of cells on the rest of the measured angle.
 
     Parameters
     ----------
     log_weight, u_mean, u_cov, x_mean, jacobian, x_cov : ndarray
-        Fields of a :class:`~rayfix_tables.mixture.TubeMixture` of k components.
-    rest_mean : ndarray of shape (2,)
-    rest_cov : ndarray of shape (3,)
+        Fields of a :class:`~rayfix_tables.mixture.TubeMixture`.
+    begins, ends : ndarray of int64, shape (n,)
+        Components of cell ``c`` are those from ``begins[c]`` to ``ends[c]``.
+    rest_mean : ndarray of shape (n, 2), rad
+    rest_cov : ndarray of shape (n, 3), rad2
         Packed: horizontal variance, covariance, vertical variance.
-    log_factor : float
-        Added to every weight.
+    log_factor : ndarray of shape (n,)
+        Added to the logarithms of all weights of a cell.
     out_log : ndarray of shape (k,)
-        Log evidence of each component.
-    out_mean : ndarray of shape (k, 4)
+        Log evidence of each component, cell after cell.
+    out_mean : ndarray of shape (k, 4), m
         Mean of (x, path length).
-    out_cov : ndarray of shape (k, 4, 4)
+    out_cov : ndarray of shape (k, 4, 4), m2
     """
     u = np.empty(3)
     cov = np.empty((3, 3))
     cross = np.empty((3, 3))
-    for k in range(len(log_weight)):
-        p00, p01, p02 = np.float64(u_cov[k, 0]), np.float64(u_cov[k, 1]), np.float64(u_cov[k, 2])
-        p11, p12, p22 = np.float64(u_cov[k, 3]), np.float64(u_cov[k, 4]), np.float64(u_cov[k, 5])
-        s11, s12, s22 = p11 + rest_cov[0], p12 + rest_cov[1], p22 + rest_cov[2]
-        det = s11 * s22 - s12 * s12
-        i11, i12, i22 = s22 / det, -s12 / det, s11 / det
-        r1 = rest_mean[0] - u_mean[k, 1]
-        r2 = rest_mean[1] - u_mean[k, 2]
-        g1 = i11 * r1 + i12 * r2
-        g2 = i12 * r1 + i22 * r2
-        out_log[k] = log_factor + log_weight[k] - 0.5 * (r1 * g1 + r2 * g2 + np.log(det)) - LOG_2PI
-        column1 = (p01, p11, p12)
-        column2 = (p02, p12, p22)
-        prior = ((p00, p01, p02), (p01, p11, p12), (p02, p12, p22))
-        for i in range(3):
-            u[i] = column1[i] * g1 + column2[i] * g2
-            k1 = column1[i] * i11 + column2[i] * i12
-            k2 = column1[i] * i12 + column2[i] * i22
-            for j in range(3):
-                cov[i, j] = prior[i][j] - k1 * column1[j] - k2 * column2[j]
-        for i in range(3):
-            moved = np.float64(x_mean[k, i])
-            for j in range(3):
-                moved += jacobian[k, i, j] * u[j]
-                total = 0.0
-                for m in range(3):
-                    total += jacobian[k, i, m] * cov[m, j]
-                cross[i, j] = total
-            out_mean[k, i] = moved
-        out_mean[k, 3] = u_mean[k, 0] + u[0]
-        packed = 0
-        for i in range(3):
-            for j in range(i, 3):
-                total = np.float64(x_cov[k, packed])
-                packed += 1
-                for m in range(3):
-                    total += cross[i, m] * jacobian[k, j, m]
-                out_cov[k, i, j] = total
-                out_cov[k, j, i] = total
-            out_cov[k, i, 3] = cross[i, 0]
-            out_cov[k, 3, i] = cross[i, 0]
-        out_cov[k, 3, 3] = cov[0, 0]
+    place = 0
+    for c in range(len(begins)):
+        for k in range(begins[c], ends[c]):
+            p00, p01, p02 = np.float64(u_cov[k, 0]), np.float64(u_cov[k, 1]), np.float64(u_cov[k, 2])
+            p11, p12, p22 = np.float64(u_cov[k, 3]), np.float64(u_cov[k, 4]), np.float64(u_cov[k, 5])
+            s11, s12, s22 = p11 + rest_cov[c, 0], p12 + rest_cov[c, 1], p22 + rest_cov[c, 2]
+            det = s11 * s22 - s12 * s12
+            i11, i12, i22 = s22 / det, -s12 / det, s11 / det
+            r1 = rest_mean[c, 0] - u_mean[k, 1]
+            r2 = rest_mean[c, 1] - u_mean[k, 2]
+            g1 = i11 * r1 + i12 * r2
+            g2 = i12 * r1 + i22 * r2
+            out_log[place] = log_factor[c] + log_weight[k] - 0.5 * (r1 * g1 + r2 * g2 + np.log(det)) - LOG_2PI
+            column1 = (p01, p11, p12)
+            column2 = (p02, p12, p22)
+            prior = ((p00, p01, p02), (p01, p11, p12), (p02, p12, p22))
+            for i in range(3):
+                u[i] = column1[i] * g1 + column2[i] * g2
+                k1 = column1[i] * i11 + column2[i] * i12
+                k2 = column1[i] * i12 + column2[i] * i22
+                for j in range(3):
+                    cov[i, j] = prior[i][j] - k1 * column1[j] - k2 * column2[j]
+            for i in range(3):
+                moved = np.float64(x_mean[k, i])
+                for j in range(3):
+                    moved += jacobian[k, i, j] * u[j]
+                    total = 0.0
+                    for m in range(3):
+                        total += jacobian[k, i, m] * cov[m, j]
+                    cross[i, j] = total
+                out_mean[place, i] = moved
+            out_mean[place, 3] = u_mean[k, 0] + u[0]
+            packed = 0
+            for i in range(3):
+                for j in range(i, 3):
+                    total = np.float64(x_cov[k, packed])
+                    packed += 1
+                    for m in range(3):
+                        total += cross[i, m] * jacobian[k, j, m]
+                    out_cov[place, i, j] = total
+                    out_cov[place, j, i] = total
+                out_cov[place, i, 3] = cross[i, 0]
+                out_cov[place, 3, i] = cross[i, 0]
+            out_cov[place, 3, 3] = cov[0, 0]
+            place += 1
 
 
 @numba.njit(cache=True, nogil=True)
-def condition_on_length(
-    log_evidence: Any,
-    mean: Any,
-    cov: Any,
-    length: Any,
-    variance: Any,
-) -> None:
+def condition_on_length(log_evidence: Any, mean: Any, cov: Any, length: Any, variance: Any) -> None:
     """Condition Gaussians over (x, path length) on a measured path length, in place.
 
     Parameters
     ----------
     log_evidence : ndarray of shape (k,)
-    mean : ndarray of shape (k, 4)
-    cov : ndarray of shape (k, 4, 4)
+    mean : ndarray of shape (k, 4), m
+    cov : ndarray of shape (k, 4, 4), m2
     length : float, m
     variance : float, m2
     """
@@ -123,10 +126,7 @@ def condition_on_length(
 
 
 @numba.njit(cache=True, nogil=True)
-def cholesky(
-    matrix: Any,
-    lower: Any,
-) -> Any:
+def cholesky(matrix: Any, lower: Any) -> Any:
     """Cholesky factor into ``lower``; False when the matrix is not positive definite."""
     size = len(matrix)
     for j in range(size):
@@ -146,10 +146,7 @@ def cholesky(
 
 
 @numba.njit(cache=True, nogil=True)
-def invert(
-    lower: Any,
-    inverse: Any,
-) -> None:
+def invert(lower: Any, inverse: Any) -> None:
     """Inverse of a matrix from its Cholesky factor, into ``inverse``."""
     size = len(lower)
     column = np.empty(size)
@@ -170,13 +167,13 @@ def invert(
 
 @numba.njit(cache=True, nogil=True)
 def to_information(
+    keep: Any,
     log_evidence: Any,
     mean: Any,
     cov: Any,
     clocks: Any,
     offsets: Any,
     variances: Any,
-    dimension: Any,
     out_information: Any,
     out_eta: Any,
     out_scale: Any,
@@ -187,24 +184,34 @@ def to_information(
 
     Parameters
     ----------
+    keep : ndarray of int64, shape (n,)
+        Gaussians to turn.
+    log_evidence : ndarray of shape (k,)
+    mean : ndarray of shape (k, 4), m
+    cov : ndarray of shape (k, 4, 4), m2
     clocks : ndarray of int64, shape (t,)
         Clock of each time of arrival; its offset is entry ``3 + clock`` of the state.
     offsets : ndarray of shape (t,), m
         Times of arrival, as lengths.
     variances : ndarray of shape (t,), m2
-    dimension : int
-        Of the state.
-    out_information : ndarray of shape (k, dimension, dimension)
-    out_eta : ndarray of shape (k, dimension)
-    out_scale : ndarray of shape (k,)
+    out_information : ndarray of shape (n, d, d), 1 / m2
+    out_eta : ndarray of shape (n, d), 1 / m
+    out_scale : ndarray of shape (n,)
     """
+    dimension = out_eta.shape[1]
     size = 4 if len(clocks) else 3
     lower = np.empty((size, size))
     inverse = np.empty((size, size))
     full = np.empty((dimension + 1, dimension + 1))
     linear = np.empty(dimension + 1)
-    for k in range(len(log_evidence)):
-        cholesky(cov[k, :size, :size], lower)
+    for n in range(len(keep)):
+        k = keep[n]
+        if not cholesky(cov[k, :size, :size], lower):
+            # What the table's rounding has made of a very flat Gaussian: an alternative of no weight.
+            out_information[n] = np.eye(dimension)
+            out_eta[n] = 0.0
+            out_scale[n] = -np.inf
+            continue
         invert(lower, inverse)
         full[:] = 0.0
         linear[:] = 0.0
@@ -235,59 +242,74 @@ def to_information(
             pivot = full[dimension, dimension]
             scale += 0.5 * (linear[dimension] * linear[dimension] / pivot + LOG_2PI - np.log(pivot))
             for i in range(dimension):
-                out_eta[k, i] = linear[i] - full[i, dimension] * linear[dimension] / pivot
+                out_eta[n, i] = linear[i] - full[i, dimension] * linear[dimension] / pivot
                 for j in range(dimension):
-                    out_information[k, i, j] = full[i, j] - full[i, dimension] * full[dimension, j] / pivot
+                    out_information[n, i, j] = full[i, j] - full[i, dimension] * full[dimension, j] / pivot
         else:
             for i in range(dimension):
-                out_eta[k, i] = linear[i]
+                out_eta[n, i] = linear[i]
                 for j in range(dimension):
-                    out_information[k, i, j] = full[i, j]
-        out_scale[k] = scale
+                    out_information[n, i, j] = full[i, j]
+        out_scale[n] = scale
 
 
 @numba.njit(cache=True, nogil=True)
 def log_integral(
-    information: Any,
-    eta: Any,
-    log_scale: Any,
-    log_volume: Any,
-    lower: Any,
-    solved: Any,
+    information: Any, eta: Any, log_scale: Any, log_volume: Any, log_range: Any, work: Any, solved: Any
 ) -> Any:
-    """Logarithm of the integral of a factor over the state; over the volume where nothing constrains the position.
+    """Logarithm of the integral of a factor over the state; -inf when it has none.
 
     Parameters
     ----------
-    lower : ndarray of shape (dimension, dimension)
+    information : ndarray of shape (d, d)
+        Only the lower triangle is read.
+    log_volume : float
+        Natural logarithm of the free space's volume [m3], which stands for a position that nothing constrains.
+    log_range : float
+        Natural logarithm of the range [m] of a clock that nothing constrains.
+    work : ndarray of shape (d, d)
         Scratch.
-    solved : ndarray of shape (dimension,)
+    solved : ndarray of shape (d,)
         Scratch.
     """
     size = len(eta)
-    if information[0, 0] + information[1, 1] + information[2, 2] <= 0.0:
-        total = log_scale + log_volume
-        for i in range(3, size):
-            total += 0.5 * (eta[i] * eta[i] / information[i, i] + LOG_2PI - np.log(information[i, i]))
-        return total
-    if not cholesky(information, lower):
-        return -np.inf
-    total = log_scale + 0.5 * size * LOG_2PI
-    for i in range(size):
-        value = eta[i]
-        for k in range(i):
-            value -= lower[i, k] * solved[k]
-        solved[i] = value / lower[i, i]
-        total += 0.5 * solved[i] * solved[i] - np.log(lower[i, i])
-    return total
+    if information[0, 0] <= 0.0:
+        return log_scale + log_volume + (size - 3) * log_range
+    # L D L': below the diagonal of ``work`` is L, above it D L', on it D.
+    total = log_scale
+    square = 0.0
+    det = 1.0
+    for j in range(size):
+        pivot = information[j, j]
+        value = eta[j]
+        if pivot <= 0.0:
+            total += log_range
+            work[j, j] = 1.0
+            solved[j] = 0.0
+            for k in range(j):
+                work[j, k] = 0.0
+                work[k, j] = 0.0
+            continue
+        for k in range(j):
+            entry = information[j, k]
+            for m in range(k):
+                entry -= work[j, m] * work[m, k]
+            work[k, j] = entry
+            work[j, k] = entry / work[k, k]
+            pivot -= entry * work[j, k]
+            value -= work[j, k] * solved[k]
+        if not pivot > 0.0:
+            return -np.inf
+        work[j, j] = pivot
+        solved[j] = value
+        square += value * value / pivot
+        det *= pivot
+        total += 0.5 * LOG_2PI
+    return total + 0.5 * (square - np.log(det))
 
 
 @numba.njit(cache=True, nogil=True)
-def _sift_down(
-    scores: Any,
-    order: Any,
-    count: Any,
-) -> None:
+def _sift_down(scores: Any, order: Any, count: Any) -> None:
     """Restore the heap whose least score is at ``order[0]``, after that entry has changed."""
     i = 0
     while True:
@@ -311,6 +333,7 @@ def extend_beam(
     factor_scale: Any,
     width: Any,
     log_volume: Any,
+    log_range: Any,
 ) -> Any:
     """Multiply every hypothesis by every alternative of a factor and keep the best products.
 
@@ -324,8 +347,8 @@ def extend_beam(
     factor_scale : ndarray of shape (k,)
     width : int
         Products to keep.
-    log_volume : float
-        Natural logarithm of the free space's volume [m3].
+    log_volume, log_range : float
+        As in :func:`log_integral`.
 
     Returns
     -------
@@ -335,17 +358,24 @@ def extend_beam(
         Log evidence of each product.
     """
     size = eta.shape[1]
-    lower = np.empty((size, size))
+    work = np.empty((size, size))
     solved = np.empty(size)
     product = np.empty((size, size))
     linear = np.empty(size)
-    # No product integrates to more than the one's integral times the other's peak.
+    # No product integrates to more than the one's integral times the other's peak, except where the one is constant
+    # and the other wider than the range that this constant is taken to have.
     own = np.empty(len(log_scale))
+    bound = np.empty(len(log_scale))
     for h in range(len(log_scale)):
-        own[h] = log_integral(information[h], eta[h], log_scale[h], log_volume, lower, solved)
+        own[h] = log_integral(information[h], eta[h], log_scale[h], log_volume, log_range, work, solved)
+        bound[h] = own[h] if information[h, 0, 0] > 0.0 else np.inf
+    least_precision = 4.0 * np.pi * np.exp(-2.0 * log_range)
     peak = np.empty(len(factor_scale))
     for k in range(len(factor_scale)):
         peak[k] = _log_peak(factor_information[k], factor_eta[k], factor_scale[k])
+        for c in range(3, size):
+            if 0.0 < factor_information[k, c, c] < least_precision:
+                peak[k] = np.inf
     parent = np.empty(width, np.int64)
     choice = np.empty(width, np.int64)
     score = np.empty(width)
@@ -353,13 +383,13 @@ def extend_beam(
     count = 0
     for h in np.argsort(-own):
         for k in range(len(factor_scale)):
-            if count == width and own[h] + peak[k] <= score[heap[0]]:
+            if count == width and bound[h] + peak[k] <= score[heap[0]]:
                 continue
             for i in range(size):
                 linear[i] = eta[h, i] + factor_eta[k, i]
                 for j in range(i + 1):
                     product[i, j] = information[h, i, j] + factor_information[k, i, j]
-            value = log_integral(product, linear, log_scale[h] + factor_scale[k], log_volume, lower, solved)
+            value = log_integral(product, linear, log_scale[h] + factor_scale[k], log_volume, log_range, work, solved)
             if count < width:
                 parent[count], choice[count], score[count] = h, k, value
                 # Sift up.
@@ -379,11 +409,7 @@ def extend_beam(
 
 
 @numba.njit(cache=True, nogil=True)
-def _log_peak(
-    information: Any,
-    eta: Any,
-    log_scale: Any,
-) -> Any:
+def _log_peak(information: Any, eta: Any, log_scale: Any) -> Any:
     """Logarithm of a factor's largest value; the state may be constrained in some directions only."""
     size = len(eta)
     lower = np.zeros((size, size))
@@ -395,7 +421,7 @@ def _log_peak(
         for k in range(j):
             pivot -= lower[j, k] * lower[j, k]
             value -= lower[j, k] * solved[k]
-        if pivot <= 1e-9:
+        if pivot <= 0.0:
             continue
         root = np.sqrt(pivot)
         lower[j, j] = root
@@ -407,70 +433,3 @@ def _log_peak(
                 rest -= lower[i, k] * lower[j, k]
             lower[i, j] = rest / root
     return total
-
-
-@numba.njit(cache=True, nogil=True)
-def climb(
-    log_density: Any,
-    mean: Any,
-    precision: Any,
-    start: Any,
-) -> Any:
-    """Climb to a mode of a Gaussian mixture in three dimensions by the fixed point of its stationarity condition.
-
-    M. A. Carreira-Perpinan, "Mode-finding for mixtures of Gaussian distributions", IEEE Trans. PAMI 22 (11), 2000:
-    at a mode ``x = (sum r_h P_h)^-1 sum r_h P_h m_h`` with the responsibilities r_h at x.
-
-    Parameters
-    ----------
-    log_density : ndarray of shape (h,)
-        Log weight plus half the log determinant of the precision.
-    mean : ndarray of shape (h, 3), m
-    precision : ndarray of shape (h, 3, 3), 1 / m2
-    start : ndarray of shape (3,), m
-
-    Returns
-    -------
-    mode : ndarray of shape (3,), m
-    curvature : ndarray of shape (3, 3), 1 / m2
-        Mean precision of the hypotheses there.
-    """
-    count = len(log_density)
-    x = start.copy()
-    logs = np.empty(count)
-    matrix = np.empty((3, 3))
-    vector = np.empty(3)
-    lower = np.empty((3, 3))
-    inverse = np.empty((3, 3))
-    for _ in range(200):
-        top = -np.inf
-        for h in range(count):
-            square = 0.0
-            for i in range(3):
-                for j in range(3):
-                    square += (x[i] - mean[h, i]) * precision[h, i, j] * (x[j] - mean[h, j])
-            logs[h] = log_density[h] - 0.5 * square
-            top = max(top, logs[h])
-        total = 0.0
-        matrix[:] = 0.0
-        vector[:] = 0.0
-        for h in range(count):
-            share = np.exp(logs[h] - top)
-            if share < 1e-12:
-                continue
-            total += share
-            for i in range(3):
-                for j in range(3):
-                    matrix[i, j] += share * precision[h, i, j]
-                    vector[i] += share * precision[h, i, j] * mean[h, j]
-        cholesky(matrix, lower)
-        invert(lower, inverse)
-        step = 0.0
-        for i in range(3):
-            value = inverse[i, 0] * vector[0] + inverse[i, 1] * vector[1] + inverse[i, 2] * vector[2]
-            step = max(step, abs(value - x[i]))
-            x[i] = value
-        matrix /= total
-        if step < 1e-5:
-            break
-    return x, matrix

@@ -3,13 +3,16 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.beam import Hypotheses, multiply
+from rayfix_service.fusion.beam import multiply
 from rayfix_service.fusion.factors import ALL_GOOD, ALL_OUTLIER, Factor, make_factor
-from rayfix_service.fusion.modes import Modes, cut_to_free_space, find_modes, unit_points
+from rayfix_service.fusion.modes import cut_to_free_space, find_modes, unit_points
 from rayfix_service.fusion.observations import Observation, SortedReport, sort_report
 from rayfix_service.fusion.report import Angle, Candidate, Fix, Outcome, Range, Report, Status
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.table import Table
+
+_LEAST_CANDIDATE = 1e-3
+"""Candidates less probable than this are not told."""
 
 _NO_RAYS = "no ray of station '{}' comes from that direction"
 
@@ -49,21 +52,27 @@ class Locator:
             log_volume=self._log_volume,
             width=self.settings.beam_width,
         )
+        if not len(hypotheses):
+            outlier = _outlier_probabilities(observations, hypotheses.outlier, np.empty(0), 1.0)
+            return self._fix(report, "inconsistent", (), outlier, unused, hypotheses.log_lost)
         log_weight, mean, cov = cut_to_free_space(
             hypotheses.log_weight, hypotheses.mean, hypotheses.cov, self.table.scene.free_space, self._points
         )
-        log_evidence = float(np.logaddexp(_log_sum(log_weight), hypotheses.log_lost))
+        log_sum = _log_sum(log_weight)
+        log_evidence = float(np.logaddexp(log_sum, hypotheses.log_lost))
         lost = float(np.exp(hypotheses.log_lost - log_evidence))
-        log_weight = log_weight - _log_sum(log_weight)
-        keep = log_weight > max(np.log(self.settings.hypothesis_floor), float(log_weight.max()) - 30.0)
+        log_weight = log_weight - log_sum
+        weight = np.exp(log_weight) * (1.0 - lost)
+        keep = log_weight > np.log(self.settings.hypothesis_floor)
         modes = find_modes(log_weight[keep], mean[keep], cov[keep], self.table.scene.free_space)
-        outlier = _outlier_probabilities(observations, hypotheses.outlier, np.exp(log_weight))
         candidates = tuple(
             Candidate(probability=float(p) * (1.0 - lost), position=x, covariance=c)
-            for p, x, c in zip(modes.probability, modes.position, modes.cov, strict=True)
-            if p > 1e-3
+            for n, (p, x, c) in enumerate(zip(modes.probability, modes.position, modes.cov, strict=True))
+            if p > _LEAST_CANDIDATE or n == 0
         )
-        status = self._status(hypotheses, log_weight, keep, modes, lost)
+        half_bad = (hypotheses.outlier == ALL_OUTLIER).mean(axis=1) >= 0.5
+        status = self._status(candidates[0], lost + float(weight[half_bad].sum()))
+        outlier = _outlier_probabilities(observations, hypotheses.outlier, weight, lost)
         return self._fix(report, status, candidates, outlier, unused, log_evidence)
 
     def warm_up(self) -> None:
@@ -93,21 +102,13 @@ class Locator:
                     unused[index] = _NO_RAYS.format(observation.station_id)
         return observations, factors
 
-    def _status(
-        self,
-        hypotheses: Hypotheses,
-        log_weight: NDArray[np.float64],
-        keep: NDArray[np.bool_],
-        modes: Modes,
-        lost: float,
-    ) -> Status:
-        weight = np.exp(log_weight)
-        bad_factors = (hypotheses.outlier == ALL_OUTLIER).mean(axis=1)
-        if lost + (1.0 - lost) * float(weight[bad_factors >= 0.5].sum()) > 0.5:
+    def _status(self, best: Candidate, half_bad: float) -> Status:
+        """Status of a fix, given the probability that at least half of the factors are outliers."""
+        if half_bad > 0.5:
             return "inconsistent"
-        largest = float(np.sqrt(np.linalg.eigvalsh(modes.cov[0])[-1]))
-        if modes.probability[0] < self.settings.ambiguous_below:
+        if best.probability < self.settings.ambiguous_below:
             return "ambiguous"
+        largest = float(np.sqrt(np.linalg.eigvalsh(best.covariance)[-1]))
         return "insufficient" if largest > self.settings.insufficient_above else "ok"
 
     def _fix(
@@ -137,16 +138,27 @@ class Locator:
 
 
 def _outlier_probabilities(
-    observations: list[Observation], outlier: NDArray[np.int8], weight: NDArray[np.float64]
+    observations: list[Observation], outlier: NDArray[np.int8], weight: NDArray[np.float64], lost: float
 ) -> dict[int, float]:
-    """Posterior probability of each used measurement to be an outlier, by its place in the report."""
-    found: dict[int, float] = {}
+    """Posterior probability of each used measurement to be an outlier, by its place in the report.
+
+    Parameters
+    ----------
+    outlier : ndarray of int8, shape (h, n)
+        What each hypothesis takes for an outlier in each observation.
+    weight : ndarray of shape (h,)
+        Posterior probabilities of the hypotheses.
+    lost : float
+        Posterior probability that everything is an outlier.
+    """
+    bad: dict[int, NDArray[np.bool_]] = {}
     for n, observation in enumerate(observations):
         if observation.angle_index is not None:
-            found[observation.angle_index] = float(min(1.0, weight[outlier[:, n] == ALL_OUTLIER].sum()))
-        for index in observation.timing_indices:
-            found[index] = float(min(1.0, weight[outlier[:, n] != ALL_GOOD].sum()))
-    return found
+            bad[observation.angle_index] = outlier[:, n] == ALL_OUTLIER
+        for index in (*observation.timing_indices, *observation.reference_of):
+            # A time difference is as bad as the worse of its two times.
+            bad[index] = bad.get(index, False) | (outlier[:, n] != ALL_GOOD)
+    return {index: min(1.0, lost + float(weight[mask].sum())) for index, mask in bad.items()}
 
 
 def _log_sum(values: NDArray[np.float64]) -> float:

@@ -1,11 +1,17 @@
 """Find the cells of the table that answer an angle, and what is left of the measurement beside their windows.
 
-A cell's entry already holds its window N(a; 0, W). For a measured angle ``a`` with covariance R the entry is
-multiplied by what remains, N(.; a_rest, R_rest) with ``R_rest^-1 = R^-1 - W^-1`` and ``a_rest = R_rest R^-1 a``, so
-that the product is N(.; a, R) exactly: the grid's quantisation costs nothing to first order.
+A cell's entry already holds its window N(.; 0, W). For a measured angle ``a`` with covariance R the entry is
+multiplied by what remains, ``f N(.; a_rest, R_rest)`` with ``R_rest^-1 = R^-1 - W^-1`` and ``a_rest = R_rest R^-1 a``,
+so that the product is N(.; a, R) exactly: the grid's quantisation costs nothing to first order. With D = W - R this is
 
-Where R is wider than the coarsest window allows, it is split into R' that fits and D = R - R', and the cells along that
-axis are summed with weights N(cell; a, D). An angle that is not measured is the limit of it: all cells alike.
+    R_rest = W D^-1 R        a_rest = W D^-1 a        log f = log(2 pi |W| / sqrt|D|) + a . D^-1 a / 2
+
+Where R is wider than the coarsest window allows, it is split into R' that fits and the excess R - R', and the cells
+along that axis are summed, weighted by their distance from ``a``. An angle that is not measured is the limit of it:
+all cells alike.
+
+What the factor approximates is the density of the measured angle per steradian when both angles were measured, per
+radian when one was, and 1 when none was.
 """
 
 from dataclasses import dataclass
@@ -13,14 +19,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.angles import tangent, wrap
+from rayfix_tables.angles import wrap
 from rayfix_tables.table import Level
 
 WINDOW_RATIO = 1.25
 """A window's standard deviation is at least this times that of a measurement it serves."""
 
 _SUM_REACH = 3.0
-"""Cells within this many standard deviations of a wide measurement are summed."""
+"""Cells within this many standard deviations of their weights are summed."""
+
+_LEAST_SPREAD = 0.6
+"""Least standard deviation of the weights of a sum, in steps from cell to cell: narrower ones would not add up to 1."""
+
+_LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,9 +86,16 @@ def look_up(levels: tuple[Level, ...], measured: Direction) -> Lookup:
     levels : tuple of Level
         Finest first.
     """
-    for level in levels:
-        if _limit(level) >= _widest_variance(level, measured):
-            return _single_cell(level, measured)
+    if measured.azimuth is not None and measured.zenith is not None:
+        for level in levels:
+            cell = int(level.grid.nearest(measured.azimuth, measured.zenith))
+            azimuth, zenith = level.grid.centres[cell].tolist()
+            sine = float(np.sin(zenith))
+            # The noise in the cell's tangent plane.
+            hh, hv, vv = measured.cov[0, 0] * sine**2, measured.cov[0, 1] * sine, measured.cov[1, 1]
+            if 0.5 * (hh + vv) + np.hypot(0.5 * (hh - vv), hv) <= _limit(level):
+                offset = (sine * float(wrap(measured.azimuth - azimuth)), measured.zenith - zenith)
+                return _single_cell(level, cell, offset, (hh, hv, vv))
     return _cell_sum(levels[-1], measured)
 
 
@@ -86,61 +104,57 @@ def _limit(level: Level) -> float:
     return (level.window / WINDOW_RATIO) ** 2
 
 
-def _widest_variance(level: Level, measured: Direction) -> float:
-    """Largest variance of the measurement along any axis of its cell's tangent plane."""
-    if measured.azimuth is None or measured.zenith is None:
-        return np.inf
-    cell = int(level.grid.nearest(measured.azimuth, measured.zenith))
-    cov = _tangent_cov(measured.cov, level.grid.centres[cell, 1])
-    half_sum, half_difference = 0.5 * (cov[0] + cov[2]), 0.5 * (cov[0] - cov[2])
-    return float(half_sum + np.hypot(half_difference, cov[1]))
-
-
-def _tangent_cov(cov: NDArray[np.float64], zenith: float) -> NDArray[np.float64]:
-    """Covariance of azimuth and zenith in a tangent plane, packed."""
-    sine = np.sin(zenith)
-    return np.array([cov[0, 0] * sine * sine, cov[0, 1] * sine, cov[1, 1]])
-
-
-def _single_cell(level: Level, measured: Direction) -> Lookup:
-    assert measured.azimuth is not None
-    assert measured.zenith is not None
-    cell = int(level.grid.nearest(measured.azimuth, measured.zenith))
-    centre_azimuth, centre_zenith = level.grid.centres[cell]
-    offset = tangent(measured.azimuth, measured.zenith, centre_azimuth, centre_zenith)
-    hh, hv, vv = _tangent_cov(measured.cov, centre_zenith)
-    noise = np.array([[hh, hv], [hv, vv]])
-    precision = np.linalg.inv(noise)
-    rest = np.linalg.inv(precision - np.eye(2) / level.window**2)
-    rest_mean = rest @ precision @ offset
-    # N(.; a, R) = factor N(.; 0, W) N(.; a_rest, R_rest), compared at the cell's centre.
-    log_factor = (
-        -0.5 * offset @ precision @ offset
-        + 0.5 * rest_mean @ np.linalg.solve(rest, rest_mean)
-        + 0.5 * np.log(np.linalg.det(rest) / np.linalg.det(noise))
-        + np.log(2.0 * np.pi * level.window**2)
-    )
+def _single_cell(level: Level, cell: int, offset: tuple[float, float], noise: tuple[float, float, float]) -> Lookup:
+    """Look up in one cell, from which the measurement is ``offset`` away, with noise of a packed covariance."""
+    (a_h, a_v), (hh, hv, vv) = offset, noise
+    window = level.window**2
+    d_hh, d_vv = window - hh, window - vv
+    det = d_hh * d_vv - hv * hv
+    # D^-1 = [[d_vv, hv], [hv, d_hh]] / det
+    g_h, g_v = (d_vv * a_h + hv * a_v) / det, (hv * a_h + d_hh * a_v) / det
+    scale = window / det
+    rest = [(d_vv * hh + hv * hv) * scale, window * hv * scale, (d_hh * vv + hv * hv) * scale]
+    log_factor = _LOG_2PI + 2.0 * np.log(window) - 0.5 * np.log(det) + 0.5 * (a_h * g_h + a_v * g_v)
     return Lookup(
         level=level,
         cells=np.array([cell]),
-        rest_mean=rest_mean[None],
-        rest_cov=np.array([[rest[0, 0], rest[0, 1], rest[1, 1]]]),
+        rest_mean=np.array([[window * g_h, window * g_v]]),
+        rest_cov=np.array([rest]),
         log_factor=np.array([log_factor]),
     )
 
 
 def _cell_sum(level: Level, measured: Direction) -> Lookup:
     """Sum cells along the axes whose noise is too wide; a correlation of the noise is then left aside."""
-    limit = _limit(level)
+    num_rings = level.grid.num_rings
+    height = np.pi / num_rings
+    zeniths = (np.arange(num_rings) + 0.5) * height
+    limit, window = _limit(level), level.window**2
+    if measured.zenith is None:
+        rings, vertical, log_rings = _share(np.zeros(num_rings), np.inf, limit, height)
+        per_angle = 1.0
+    else:
+        from_rings = np.asarray(measured.zenith - zeniths, np.float64)
+        rings, vertical, log_rings = _share(from_rings, measured.cov[1, 1], limit, height)
+        per_angle = float(np.sin(zeniths[np.argmin(np.abs(from_rings))]))
+    var_v, rest_v, log_v = _remainder(vertical, min(measured.cov[1, 1], limit), window)
     cells, means, variances, logs = [], [], [], []
-    for ring, vertical, log_ring in zip(*_along_zenith(level, measured), strict=True):
-        steps, horizontal, variance, log_step = _along_ring(level, int(ring), measured)
+    for n, ring in enumerate(rings):
+        count, sine = int(level.grid.ring_cells[ring]), float(np.sin(zeniths[ring]))
+        width = 2.0 * np.pi / count
+        if measured.azimuth is None:
+            variance, log_sine = np.inf, 0.0
+            offset = np.zeros(count)
+        else:
+            # Tangent coordinates stretch the azimuth's density by 1 / sine.
+            variance, log_sine = measured.cov[0, 0] * sine**2, np.log(sine / per_angle)
+            offset = sine * wrap(measured.azimuth - (-np.pi + (np.arange(count) + 0.5) * width))
+        steps, horizontal, log_steps = _share(offset, variance, limit, sine * width)
+        var_h, rest_h, log_h = _remainder(horizontal, min(variance, limit), window)
         cells.append(level.grid.ring_offsets[ring] + steps)
-        rest_h, var_h, log_h = _remainder(horizontal, variance, level.window**2)
-        rest_v, var_v, log_v = _remainder(vertical, min(measured.cov[1, 1], limit), level.window**2)
-        means.append(np.stack(np.broadcast_arrays(rest_h, rest_v), axis=-1))
+        means.append(np.stack([rest_h, np.full(len(steps), rest_v[n])], axis=-1))
         variances.append(np.broadcast_to([var_h, 0.0, var_v], (len(steps), 3)))
-        logs.append(log_h + log_v + log_ring + log_step)
+        logs.append(log_h + log_steps + (log_v[n] + log_rings[n] + log_sine))
     return Lookup(
         level=level,
         cells=np.concatenate(cells),
@@ -150,54 +164,51 @@ def _cell_sum(level: Level, measured: Direction) -> Lookup:
     )
 
 
-def _along_zenith(
-    level: Level, measured: Direction
+def _share(
+    offset: NDArray[np.float64], variance: float, limit: float, step: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Rings to sum over, the offset of the measurement from each, and their log weights."""
-    num_rings = level.grid.num_rings
-    height = np.pi / num_rings
-    centres = (np.arange(num_rings) + 0.5) * height
-    if measured.zenith is None:
-        return np.arange(num_rings), np.zeros(num_rings), np.full(num_rings, np.log(height))
-    spread = measured.cov[1, 1] - _limit(level)
-    offset = measured.zenith - centres
-    if spread <= 0.0:
-        ring = min(max(int(measured.zenith / height), 0), num_rings - 1)
-        return np.array([ring]), offset[ring : ring + 1], np.zeros(1)
-    rings = np.flatnonzero(np.abs(offset) <= max(_SUM_REACH * np.sqrt(spread), height))
-    return rings, np.zeros(len(rings)), _log_normal(offset[rings], spread) + np.log(height)
+    """Share a measurement among the cells along one axis.
 
+    Parameters
+    ----------
+    offset : ndarray of shape (n,), rad
+        Of the measurement from each cell's centre.
+    variance : float, rad2
+        Of the measurement; infinite when there is none.
+    limit : float, rad2
+        Largest variance that one cell takes.
+    step : float, rad
+        From cell to cell.
 
-def _along_ring(
-    level: Level, ring: int, measured: Direction
-) -> tuple[NDArray[np.int64], NDArray[np.float64], float, NDArray[np.float64]]:
-    """Cells of a ring to sum over, the tangent offset from each, the noise that is left, and their log weights."""
-    count = int(level.grid.ring_cells[ring])
-    sine = float(np.sin((ring + 0.5) * np.pi / level.grid.num_rings))
-    width = 2.0 * np.pi / count
-    limit = _limit(level)
-    if measured.azimuth is None:
-        return np.arange(count), np.zeros(count), limit, np.full(count, np.log(sine * width))
-    variance = measured.cov[0, 0] * sine**2
-    offset = sine * wrap(measured.azimuth - (-np.pi + (np.arange(count) + 0.5) * width))
-    if variance <= limit:
-        step = int(np.argmin(np.abs(offset)))
-        return np.array([step]), offset[step : step + 1], variance, np.zeros(1)
-    spread = variance - limit
-    steps = np.flatnonzero(np.abs(offset) <= max(_SUM_REACH * np.sqrt(spread), sine * width))
-    log_weight = _log_normal(offset[steps], spread) + np.log(sine * width)
-    return steps, np.zeros(len(steps)), limit, log_weight
+    Returns
+    -------
+    index : ndarray of int64, shape (m,)
+        Cells that take part.
+    offset : ndarray of shape (m,), rad
+        Of the measurement that each of them gets, of variance at most ``limit``.
+    log_weight : ndarray of shape (m,)
+    """
+    excess = variance - limit
+    if excess <= 0.0:
+        nearest = int(np.argmin(np.abs(offset)))
+        return np.array([nearest]), offset[nearest : nearest + 1], np.zeros(1)
+    if np.isinf(excess):
+        return np.arange(len(offset)), np.zeros(len(offset)), np.full(len(offset), np.log(step))
+    spread = max(excess, (_LEAST_SPREAD * step) ** 2)
+    index = np.flatnonzero(np.abs(offset) <= _SUM_REACH * np.sqrt(spread))
+    # Where the weights are wider than the excess, moving the parts towards the measurement makes up for it.
+    moved = (1.0 - np.sqrt(excess / spread)) * offset[index]
+    return index, moved, _log_normal(offset[index], spread) + np.log(step)
 
 
 def _remainder(
-    offset: NDArray[np.float64], variance: float, window_variance: float
-) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
-    """``a_rest``, ``R_rest`` and the log factor along one axis."""
-    rest_variance = 1.0 / (1.0 / variance - 1.0 / window_variance)
-    rest_mean = offset * rest_variance / variance
-    at_centre = _log_normal(np.zeros(1), window_variance) + _log_normal(rest_mean, rest_variance)
-    return rest_mean, rest_variance, _log_normal(offset, variance) - at_centre
+    offset: NDArray[np.float64], variance: float, window: float
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """``R_rest``, ``a_rest`` and log f along one axis, where W is ``window``."""
+    left = window - variance
+    log_factor = 0.5 * (_LOG_2PI + 2.0 * np.log(window) - np.log(left) + offset**2 / left)
+    return window * variance / left, window * offset / left, log_factor
 
 
 def _log_normal(offset: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
-    return np.asarray(-0.5 * (offset**2 / variance + np.log(2.0 * np.pi * variance)))
+    return np.asarray(-0.5 * (offset**2 / variance + np.log(variance) + _LOG_2PI))

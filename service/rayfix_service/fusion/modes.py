@@ -1,4 +1,4 @@
-"""From a mixture of hypotheses to candidates: modes of the posterior, and which hypotheses belong to which.
+"""From a mixture of hypotheses to candidates: the hills of the posterior, and which hypotheses belong to which.
 
 The posterior is zero outside the free space, so each Gaussian is first cut to it: a fixed set of points stands for the
 Gaussian, and what lies in the free space gives the cut one's weight, mean and covariance.
@@ -7,28 +7,34 @@ Gaussian, and what lies in the free space gives the cut one's weight, mean and c
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.linalg import cholesky, inv
+from numpy.linalg import cholesky, inv, slogdet
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.kernels import climb
+from rayfix_service.fusion.mode_kernels import cut_gaussians, gather
 from rayfix_tables.freespace import FreeSpace
 
 _LEAST_FREE_SHARE = 1e-3
-_SAME_MODE = 9.0
+"""Weight that is left of a Gaussian which lies in a solid: the scene is not exact to the voxel."""
+
+_SAME_HILL = 9.0
+
+_NEAR = 3.0
+"""A position in a solid moves to free space within this many standard deviations."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Modes:
-    """Modes of the posterior, the most probable first.
+    """Hills of the posterior, the most probable first.
 
     Attributes
     ----------
     probability : ndarray of shape (m,)
     position : ndarray of shape (m, 3), m
+        Mean of the hill's hypotheses; the hill's mode, or the nearest free place, where the mean is in a solid.
     cov : ndarray of shape (m, 3, 3), m2
-        Second moment of the mode's hypotheses about ``position``.
+        Second moment of the hill's hypotheses about ``position``.
     member : ndarray of int64, shape (h,)
-        Mode of each hypothesis.
+        Hill of each hypothesis.
     """
 
     probability: NDArray[np.float64]
@@ -50,7 +56,7 @@ def unit_points(count: int = 128) -> NDArray[np.float64]:
     points = np.concatenate([normal, third[:, None]], axis=1)
     points = np.concatenate([points, -points])
     root = cholesky(np.cov(points.T, bias=True))
-    return np.asarray(np.linalg.solve(root, points.T).T)
+    return np.ascontiguousarray(np.linalg.solve(root, points.T).T)
 
 
 def cut_to_free_space(
@@ -67,28 +73,15 @@ def cut_to_free_space(
     points : ndarray of shape (n, 3)
         From :func:`unit_points`.
     """
-    spread = mean[:, None, :] + np.einsum("hij,nj->hni", cholesky(cov), points)
-    free = free_space.contains(spread)
-    share = free.mean(axis=1)
-    cut = np.flatnonzero((share < 1.0) & (share > 0.0))
-    mean, cov = mean.copy(), cov.copy()
-    for h in cut:
-        inside = spread[h][free[h]]
-        mean[h] = inside.mean(axis=0)
-        if len(inside) > 8:
-            centred = inside - mean[h]
-            # A little of the uncut covariance keeps the cut one regular.
-            cov[h] = 0.9 * centred.T @ centred / len(inside) + 0.1 * cov[h]
+    mean, cov, share = mean.copy(), cov.copy(), np.empty(len(mean))
+    cut_gaussians(mean, cov, points, free_space.origin, free_space.voxel_size, free_space.free, share)
     return log_weight + np.log(np.maximum(share, _LEAST_FREE_SHARE)), mean, cov
 
 
 def find_modes(
-    log_weight: NDArray[np.float64],
-    mean: NDArray[np.float64],
-    cov: NDArray[np.float64],
-    free_space: FreeSpace,
+    log_weight: NDArray[np.float64], mean: NDArray[np.float64], cov: NDArray[np.float64], free_space: FreeSpace
 ) -> Modes:
-    """Climb from hypotheses to modes and gather the hypotheses by the mode they belong to.
+    """Climb from hypotheses to modes and gather the hypotheses by the hill they belong to.
 
     Parameters
     ----------
@@ -96,40 +89,47 @@ def find_modes(
         Natural logarithms; the weights sum to 1.
     """
     precision = inv(cov)
-    log_density = log_weight + 0.5 * np.linalg.slogdet(precision)[1]
-    count = len(log_weight)
-    member = np.full(count, -1)
-    tops: list[NDArray[np.float64]] = []
-    top_precisions: list[NDArray[np.float64]] = []
-    for h in np.argsort(-log_density):
-        top, curvature = climb(log_density, mean, precision, mean[h])
-        for n, (other, other_precision) in enumerate(zip(tops, top_precisions, strict=True)):
-            apart = top - other
-            # One hill, though with two humps: their distance is within what either is uncertain by.
-            if min(apart @ other_precision @ apart, apart @ curvature @ apart) < _SAME_MODE:
-                member[h] = n
-                break
-        else:
-            member[h] = len(tops)
-            tops.append(top)
-            top_precisions.append(curvature)
-    weight = np.exp(log_weight)
-    modes = []
-    for n, top in enumerate(tops):
-        mine = member == n
-        share = weight[mine] / weight[mine].sum()
-        position = share @ mean[mine]
-        if not free_space.contains(position):
-            position = top
-        apart = mean[mine] - position
-        moment = np.einsum("h,hij->ij", share, cov[mine] + apart[:, :, None] * apart[:, None, :])
-        modes.append((float(weight[mine].sum()), position, moment))
-    order = np.argsort([-m[0] for m in modes], kind="stable")
-    rank = np.empty(len(modes), np.int64)
-    rank[order] = np.arange(len(modes))
-    return Modes(
-        probability=np.array([modes[i][0] for i in order]),
-        position=np.array([modes[i][1] for i in order]),
-        cov=np.array([modes[i][2] for i in order]),
-        member=rank[member],
-    )
+    top, member = gather(log_weight + 0.5 * slogdet(precision)[1], mean, precision, _SAME_HILL)
+    belongs = np.exp(log_weight) * (member == np.arange(len(top))[:, None])
+    probability = belongs.sum(axis=1)
+    share = belongs / probability[:, None]
+    position = share @ mean
+    in_solid = ~free_space.contains(position)
+    position[in_solid] = top[in_solid]
+    moment = _second_moments(share, mean - position[member], cov)
+    in_solid = ~free_space.contains(position)
+    if in_solid.any():
+        for n in np.flatnonzero(in_solid):
+            position[n] = _nearest_free(position[n], moment[n], free_space)
+        moment = _second_moments(share, mean - position[member], cov)
+    order = np.argsort(-probability, kind="stable")
+    rank = np.empty(len(top), np.int64)
+    rank[order] = np.arange(len(top))
+    return Modes(probability=probability[order], position=position[order], cov=moment[order], member=rank[member])
+
+
+def _second_moments(
+    share: NDArray[np.float64], apart: NDArray[np.float64], cov: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Second moment of each hill, shape (m, 3, 3), from its hypotheses' shares, shape (m, h), and distances from it."""
+    about = cov + apart[:, :, None] * apart[:, None, :]
+    return (share @ about.reshape(-1, 9)).reshape(-1, 3, 3)
+
+
+def _nearest_free(
+    position: NDArray[np.float64], cov: NDArray[np.float64], free_space: FreeSpace
+) -> NDArray[np.float64]:
+    """Nearest place in the free space, the position itself where none is near."""
+    size = free_space.voxel_size
+    reach = _NEAR * np.sqrt(np.diag(cov)) + size
+    low = np.floor((position - reach - free_space.origin) / size).astype(np.int64)
+    high = np.floor((position + reach - free_space.origin) / size).astype(np.int64) + 1
+    low, high = np.clip(low, 0, free_space.free.shape), np.clip(high, 0, free_space.free.shape)
+    block = free_space.free[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
+    corners = free_space.origin + size * (low + np.argwhere(block))
+    if not len(corners):
+        return position
+    # Just inside the voxels: their faces may be another's.
+    places = np.clip(position, corners + 1e-6 * size, corners + (1.0 - 1e-6) * size)
+    apart = places - position
+    return np.asarray(places[np.argmin(np.einsum("ni,ij,nj->n", apart, inv(cov), apart))])

@@ -1,8 +1,9 @@
 """Sort a report's measurements by the path they are about."""
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from rayfix_service.fusion.report import Angle, Range, Report, TimeDifference, T
 from rayfix_tables.angles import angles_of, direction, local_to_scene
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station
+
+_ALONE = "a time of arrival from one station only says nothing: the UE's clock is unknown"
+_FAR = "the time is farther from the others of its clock than any path is long"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +39,8 @@ class Observation:
         Place of the angle in the report.
     timing_indices : tuple of int
         Places of the measurements of time in the report.
+    reference_of : tuple of int
+        Places of the time differences of which the path is the reference.
     """
 
     station_id: str
@@ -43,6 +49,7 @@ class Observation:
     readings: tuple[ClockReading, ...] = ()
     angle_index: int | None = None
     timing_indices: tuple[int, ...] = ()
+    reference_of: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,20 +63,31 @@ class SortedReport:
 
 @dataclass
 class _Draft:
-    """An observation in the making."""
+    """A station's observations in the making; a direction that cannot be used is None, and keeps its place."""
 
-    directions: list[tuple[int, Direction]] = field(default_factory=list)
+    directions: list[tuple[int, Direction] | None] = field(default_factory=list)
     lengths: list[tuple[int, float, float]] = field(default_factory=list)
-    readings: list[tuple[int, ClockReading]] = field(default_factory=list)
+    readings: list[tuple[int | None, ClockReading]] = field(default_factory=list)
+    reference_of: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Arrival:
+    """A time of arrival on some clock; ``index`` is None for the reference of time differences."""
+
+    index: int | None
+    station_id: str
+    offset: float
+    variance: float
 
 
 def sort_report(report: Report, site: SiteInfo) -> SortedReport:
     """Group measurements by station and path.
 
-    The k-th angle and the k-th propagation time of a station belong to one path; times of arrival and time differences
-    belong to its first path. A set of time differences with one reference is a set of times of arrival on a clock of
-    its own, of which the reference's reads zero: half of the smallest variance is then the reference's share, common
-    to all, so that their noise is correlated as it is.
+    The k-th angle and the k-th propagation time of a station belong to one path; further propagation times, times of
+    arrival and time differences belong to its first path. A set of time differences with one reference is a set of
+    times of arrival on a clock of its own, of which the reference's reads zero: half of the smallest variance is then
+    the reference's share, common to all, so that their noise is correlated as it is.
 
     Raises
     ------
@@ -78,49 +96,76 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
     """
     stations = {station.id: station for station in site.stations}
     drafts: defaultdict[str, _Draft] = defaultdict(_Draft)
-    arrivals: list[tuple[int, str, float, float]] = []
-    differences: defaultdict[str, list[tuple[int, str, float, float]]] = defaultdict(list)
+    arrivals: list[_Arrival] = []
+    differences: defaultdict[str, list[_Arrival]] = defaultdict(list)
     unused: dict[int, str] = {}
     for index, measurement in enumerate(report.measurements):
         station = _station(stations, measurement.station_id, index, "station_id")
         match measurement:
             case Angle():
                 measured = to_scene(measurement, station, site.north)
-                if in_field_of_view(station, measured):
-                    drafts[station.id].directions.append((index, measured))
-                else:
+                inside = in_field_of_view(station, measured)
+                drafts[station.id].directions.append((index, measured) if inside else None)
+                if not inside:
                     unused[index] = f"the angle lies outside the field of view of station '{station.id}'"
             case Range():
                 drafts[station.id].lengths.append((index, measurement.path_length, measurement.stdev**2))
-            case TimeOfArrival():
-                arrivals.append((index, station.id, measurement.path_length, measurement.stdev**2))
-            case TimeDifference():
-                reference = measurement.reference_station_id
+            case TimeOfArrival(path_length=offset):
+                arrivals.append(
+                    _Arrival(index=index, station_id=station.id, offset=offset, variance=measurement.stdev**2)
+                )
+            case TimeDifference(reference_station_id=reference, length_difference=offset):
                 _station(stations, reference, index, "reference_station_id")
-                differences[reference].append((index, station.id, measurement.length_difference, measurement.stdev**2))
+                differences[reference].append(
+                    _Arrival(index=index, station_id=station.id, offset=offset, variance=measurement.stdev**2)
+                )
+    clocks = [arrivals, *(_on_one_clock(reference, rows) for reference, rows in differences.items())]
     num_clocks = 0
-    if len({station_id for _, station_id, _, _ in arrivals}) > 1:
-        # Counted from their mean, the clock's offset is a mere path length, whatever the clock shows.
-        zero = float(np.mean([offset for _, _, offset, _ in arrivals]))
-        for index, station_id, offset, variance in arrivals:
-            reading = ClockReading(clock=num_clocks, offset=offset - zero, variance=variance)
-            drafts[station_id].readings.append((index, reading))
-        num_clocks += 1
-    else:
-        unused.update(
-            {i: "a time of arrival from one station only says nothing: the UE's clock is unknown" for i, *_ in arrivals}
-        )
-    for reference, rows in differences.items():
-        shared = 0.5 * min(variance for *_, variance in rows)
-        drafts[reference].readings.append((-1, ClockReading(clock=num_clocks, offset=0.0, variance=shared)))
-        for index, station_id, offset, variance in rows:
-            reading = ClockReading(clock=num_clocks, offset=offset, variance=variance - shared)
-            drafts[station_id].readings.append((index, reading))
-        num_clocks += 1
+    for clock in clocks:
+        near = _near_each_other(clock, site.max_path_length)
+        if len({row.station_id for row in near}) > 1:
+            near_indices = [row.index for row in near if row.index is not None]
+            for row in near:
+                reading = ClockReading(clock=num_clocks, offset=row.offset, variance=row.variance)
+                drafts[row.station_id].readings.append((row.index, reading))
+                if row.index is None:
+                    drafts[row.station_id].reference_of += near_indices
+            num_clocks += 1
+            unused.update({row.index: _FAR for row in clock if row.index not in (None, *near_indices)})
+        else:
+            alone = len({row.station_id for row in clock}) == 1
+            unused.update({row.index: _ALONE if alone else _FAR for row in clock if row.index is not None})
     observations = [
         observation for station_id, draft in drafts.items() for observation in _observations(station_id, draft)
     ]
     return SortedReport(observations=tuple(observations), num_clocks=num_clocks, unused=unused)
+
+
+def _on_one_clock(reference: str, differences: list[_Arrival]) -> list[_Arrival]:
+    """Times of arrival that have these differences to the reference's."""
+    shared = 0.5 * min(row.variance for row in differences)
+    return [
+        _Arrival(index=None, station_id=reference, offset=0.0, variance=shared),
+        *(replace(row, variance=row.variance - shared) for row in differences),
+    ]
+
+
+def _near_each_other(clock: list[_Arrival], max_path_length: float) -> list[_Arrival]:
+    """Times of arrival counted from their middle, without those that are farther from it than paths can make them.
+
+    Counted so, the clock's offset is a mere path length whatever the clock shows, and squares keep their precision.
+    """
+    if not clock:
+        return []
+    rows = sorted(clock, key=lambda row: row.offset)
+    weight = np.cumsum([1.0 / row.variance for row in rows])
+    middle = rows[int(np.searchsorted(weight, 0.5 * weight[-1]))]
+    return [
+        replace(row, offset=row.offset - middle.offset)
+        for row in clock
+        if abs(row.offset - middle.offset)
+        <= 2.0 * max_path_length + 10.0 * (math.sqrt(row.variance) + math.sqrt(middle.variance))
+    ]
 
 
 def to_scene(angle: Angle, station: Station, north: float) -> Direction:
@@ -169,12 +214,14 @@ def _basis(azimuth: float, zenith: float) -> np.ndarray[tuple[int, ...], np.dtyp
 
 
 def _observations(station_id: str, draft: _Draft) -> list[Observation]:
-    count = max(len(draft.directions), len(draft.lengths), 1)
+    count = max(len(draft.directions), 1)
     observations = []
     for k in range(count):
         angle = draft.directions[k] if k < len(draft.directions) else None
-        lengths = draft.lengths[k : k + 1]
+        lengths = draft.lengths[k : k + 1] + (draft.lengths[count:] if k == 0 else [])
         readings = draft.readings if k == 0 else []
+        if angle is None and not lengths and not readings:
+            continue
         observations.append(
             Observation(
                 station_id=station_id,
@@ -182,9 +229,8 @@ def _observations(station_id: str, draft: _Draft) -> list[Observation]:
                 lengths=tuple((length, variance) for _, length, variance in lengths),
                 readings=tuple(reading for _, reading in readings),
                 angle_index=angle[0] if angle else None,
-                timing_indices=tuple(
-                    i for i in [*(row[0] for row in lengths), *(row[0] for row in readings)] if i >= 0
-                ),
+                timing_indices=tuple(i for i, *_ in [*lengths, *readings] if i is not None),
+                reference_of=tuple(draft.reference_of) if k == 0 else (),
             )
         )
     return observations

@@ -89,7 +89,7 @@ class Candidate:
     probability : float
         Posterior probability that the UE is there.
     position : ndarray of shape (3,), m
-        Mode of the posterior density.
+        Mean of the posterior over one of its hills.
     covariance : ndarray of shape (3, 3), m2
         Second moment of the posterior about ``position``.
     """
@@ -125,7 +125,7 @@ class Fix:
     status : {"ok", "ambiguous", "inconsistent", "insufficient"}
         Whether the position can be trusted; docs/how-it-works.md defines each.
     candidates : tuple of Candidate
-        Most probable first; empty when no measurement could be used.
+        Most probable first; empty when no measurement could be used or all contradict the table.
     outcomes : tuple of Outcome
         One per measurement of the report, in its order.
     log_evidence : float

@@ -1,0 +1,303 @@
+"""Files that are no table, or no longer one: one line that names the file and the remedy."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError, TableError
+from rayfix_tables.mixture import FIELD_SHAPES
+from rayfix_tables.schema import LEVEL_DATASETS, SCENE_DATASETS
+from rayfix_tables.table import Table
+
+REBUILD = "restore it from a copy or build it again"
+LEVEL = "stations/bs1/levels/1"
+DATASETS = [*SCENE_DATASETS, *(f"{LEVEL}/{name}" for name in LEVEL_DATASETS)]
+ATTRIBUTES = [
+    ("/", "site"),
+    ("/", "table_id"),
+    ("/", "software_version"),
+    ("/", "scene_sha256"),
+    ("scene", "materials"),
+    ("scene/free_space", "origin_m"),
+    ("scene/free_space", "voxel_size_m"),
+    ("stations/bs0", "position_m"),
+    ("stations/bs0", "orientation_deg"),
+    ("stations/bs0", "field_of_view_deg"),
+    ("stations/bs0", "lost_ray_share"),
+    ("stations/bs0", "coverage"),
+    (LEVEL, "window_deg"),
+]
+
+
+def refused(path: Path, kind: type[TableError], remedy: str, *, read: Callable[[Path], Any] = Table.open) -> str:
+    """Check that a file is refused for this reason, exactly, in one line; return that line."""
+    with pytest.raises(TableError) as caught:
+        read(path)
+    assert type(caught.value) is kind
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path) in message
+    assert remedy in message
+    return message
+
+
+def verified(path: Path) -> None:
+    """Open a table and check its checksums."""
+    Table.open(path).verify()
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    path = tmp_path / "none.h5"
+    assert refused(path, TableError, f"rayfix build SITE.toml -o {path}").startswith("there is no table")
+
+
+def test_a_folder(tmp_path: Path) -> None:
+    refused(tmp_path, NotATableError, "give a file that 'rayfix build' wrote")
+
+
+@pytest.mark.parametrize("content", [b"", b"[site]\nname = 'hall'\n", b"\x89HDF", bytes(4096)])
+def test_not_an_hdf5_file(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "t.h5"
+    path.write_bytes(content)
+    assert "not an HDF5 file" in refused(path, NotATableError, "give a file that 'rayfix build' wrote")
+
+
+def test_another_programs_hdf5_file(tmp_path: Path) -> None:
+    path = tmp_path / "foreign.h5"
+    with h5py.File(path, "w") as file:
+        file["data"] = np.arange(5)
+    assert "HDF5 file but not a rayfix table" in refused(path, NotATableError, "give a file that 'rayfix build' wrote")
+
+
+@pytest.mark.parametrize("version", [0, 2, 99, "1", -1])
+def test_another_format_version(small_table_path: Path, version: int | str) -> None:
+    with h5py.File(small_table_path, "r+") as file:
+        file.attrs["format_version"] = version
+    message = refused(small_table_path, FormatVersionError, "build the table again with this version")
+    assert f"table format {version}" in message
+
+
+def test_a_format_version_that_is_missing(small_table_path: Path) -> None:
+    with h5py.File(small_table_path, "r+") as file:
+        del file.attrs["format_version"]
+    refused(small_table_path, FormatVersionError, "build the table again")
+
+
+def test_a_truncated_table(small_table_path: Path) -> None:
+    """Below the first 8 bytes nothing tells that it was an HDF5 file."""
+    raw = small_table_path.read_bytes()
+    for length in (0, 1, 7):
+        small_table_path.write_bytes(raw[:length])
+        refused(small_table_path, NotATableError, "give a file that 'rayfix build' wrote")
+    for length in (8, 50, 96, 100, 800, 2048, 5000, len(raw) // 2, len(raw) - 100, len(raw) - 1):
+        small_table_path.write_bytes(raw[:length])
+        refused(small_table_path, CorruptTableError, REBUILD)
+    small_table_path.write_bytes(raw)
+    verified(small_table_path)
+
+
+def test_a_longer_file_is_still_the_table(small_table_path: Path) -> None:
+    """HDF5 knows where its content ends."""
+    with small_table_path.open("ab") as file:
+        file.write(b"more")
+    verified(small_table_path)
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_a_missing_dataset(small_table_path: Path, name: str) -> None:
+    with h5py.File(small_table_path, "r+") as file:
+        del file[name]
+    refused(small_table_path, CorruptTableError, REBUILD)
+
+
+@pytest.mark.parametrize(("group", "name"), ATTRIBUTES)
+def test_a_missing_attribute(small_table_path: Path, group: str, name: str) -> None:
+    with h5py.File(small_table_path, "r+") as file:
+        del file[group].attrs[name]
+    refused(small_table_path, CorruptTableError, REBUILD)
+
+
+@pytest.mark.parametrize("group", ["scene", "stations", "stations/bs0", "stations/bs0/levels", "stations/bs0/levels/0"])
+def test_a_missing_group(small_table_path: Path, group: str) -> None:
+    with h5py.File(small_table_path, "r+") as file:
+        del file[group]
+    refused(small_table_path, CorruptTableError, REBUILD)
+
+
+@pytest.mark.parametrize("name", [n for n in DATASETS if n != "scene/free_space"])
+def test_a_dataset_of_another_length(small_table_path: Path, name: str) -> None:
+    """Of another length than the rest, or of another type: an answer from it would be nonsense."""
+    with h5py.File(small_table_path, "r+") as file:
+        shorter = file[name][:-1]
+        del file[name]
+        file[name] = shorter
+    reader = verified if name.startswith("scene") else Table.open
+    refused(small_table_path, CorruptTableError, REBUILD, read=reader)
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_a_dataset_of_another_type(small_table_path: Path, name: str) -> None:
+    with h5py.File(small_table_path, "r+") as file:
+        values = file[name][()]
+        del file[name]
+        file[name] = values.astype(np.complex64)
+    refused(small_table_path, CorruptTableError, REBUILD)
+
+
+@pytest.mark.parametrize(
+    "site", ["", "[]", "{", "7", "null", '{"station_ids": []}', '{"station_ids": ["nobody"]}', '{"station_ids": 3}']
+)
+def test_a_site_that_is_not_one(small_table_path: Path, site: str) -> None:
+    with h5py.File(small_table_path, "r+") as file:
+        file.attrs["site"] = site
+    refused(small_table_path, CorruptTableError, REBUILD)
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "value"),
+    [
+        ("stations/bs0", "position_m", np.zeros(2)),
+        ("stations/bs0", "position_m", "here"),
+        ("stations/bs0", "coverage", 0.5),
+        ("scene", "materials", "concrete"),
+        ("scene", "materials", 5),
+        (LEVEL, "window_deg", "wide"),
+        ("scene/free_space", "origin_m", "origin"),
+    ],
+)
+def test_an_attribute_of_another_type(small_table_path: Path, group: str, name: str, value: Any) -> None:
+    with h5py.File(small_table_path, "r+") as file:
+        file[group].attrs[name] = value
+    refused(small_table_path, CorruptTableError, REBUILD)
+
+
+def test_offsets_that_do_not_ascend(small_table_path: Path) -> None:
+    for change in (lambda o: o[::-1], lambda o: np.concatenate([o[:3], [o[2] - 1], o[4:]]), lambda o: o + 1):
+        with h5py.File(small_table_path, "r+") as file:
+            offsets = file[f"{LEVEL}/cell_offsets"]
+            before = offsets[()]
+            offsets[...] = change(before)
+        assert "cell_offsets" in refused(small_table_path, CorruptTableError, REBUILD)
+        with h5py.File(small_table_path, "r+") as file:
+            file[f"{LEVEL}/cell_offsets"][...] = before
+    verified(small_table_path)
+
+
+# What only the checksums find
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_one_flipped_bit_in_a_dataset(small_table_path: Path, name: str) -> None:
+    with h5py.File(small_table_path) as file:
+        offset, size = file[name].id.get_offset(), file[name].nbytes
+    raw = bytearray(small_table_path.read_bytes())
+    raw[offset + size // 2] ^= 0x01
+    small_table_path.write_bytes(raw)
+    message = refused(small_table_path, CorruptTableError, REBUILD, read=verified)
+    assert f"the checksum of {name} does not match" in message or "cell_offsets" in name or "ring_cells" in name
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "change"),
+    [
+        ("/", "table_id", lambda v: "0" * 64),
+        ("/", "scene_sha256", lambda v: "0" * 64),
+        ("/", "site", lambda v: v.replace("site 1", "site 2")),
+        ("scene", "materials", lambda v: v.replace("metal", "glass")),
+        ("scene/free_space", "voxel_size_m", lambda v: np.nextafter(v, 1)),
+        ("stations/bs0", "position_m", lambda v: np.nextafter(v, 99)),
+        ("stations/bs1", "orientation_deg", lambda v: np.nextafter(v, 999)),
+        ("stations/bs1", "field_of_view_deg", lambda v: np.nextafter(v, 999)),
+        ("stations/bs1", "lost_ray_share", lambda v: np.nextafter(v, 1)),
+        ("stations/bs1", "coverage", lambda v: np.nextafter(v, 1)),
+        (LEVEL, "window_deg", lambda v: np.nextafter(v, 99)),
+    ],
+)
+def test_one_changed_attribute(small_table_path: Path, group: str, name: str, change: Callable[[Any], Any]) -> None:
+    with h5py.File(small_table_path, "r+") as file:
+        file[group].attrs[name] = change(file[group].attrs[name])
+    assert "table_id" in refused(small_table_path, CorruptTableError, REBUILD, read=verified)
+
+
+def test_a_rewritten_checksum_does_not_hide_a_change(small_table_path: Path, make_content: Callable[..., Any]) -> None:
+    other = small_table_path.with_name("other.h5")
+    make_content(2).write(other)
+    with h5py.File(small_table_path, "r+") as file, h5py.File(other) as donor:
+        del file["scene/vertices_m"]
+        donor.copy("scene/vertices_m", file["scene"])
+    assert "table_id" in refused(small_table_path, CorruptTableError, REBUILD, read=verified)
+
+
+def test_an_added_dataset(small_table_path: Path) -> None:
+    with h5py.File(small_table_path, "r+") as file:
+        file["more"] = np.arange(3)
+    refused(small_table_path, CorruptTableError, REBUILD, read=verified)
+
+
+def test_a_changed_software_version_is_no_damage(small_table_path: Path) -> None:
+    with h5py.File(small_table_path, "r+") as file:
+        file.attrs["software_version"] = "9.9"
+    verified(small_table_path)
+    assert Table.open(small_table_path).software_version == "9.9"
+
+
+def content_of(table: Table) -> list[bytes]:
+    """Give all that decides an answer."""
+    arrays = [table.scene.vertices, table.scene.faces, table.scene.face_materials, table.scene.free_space.free]
+    words = [repr(table.site), repr(table.scene.materials), repr(table.scene.free_space.origin)]
+    for part in table.parts.values():
+        words.append(repr((part.station, part.lost_ray_share, part.coverage)))
+        for level in part.levels:
+            words.append(repr(level.window))
+            arrays += [level.grid.ring_cells, level.cell_offsets, level.cell_log_mass]
+            arrays += [getattr(level.mixture, name) for name in FIELD_SHAPES]
+    return [*(word.encode() for word in words), *(array.tobytes() for array in arrays)]
+
+
+def test_a_changed_byte_anywhere_is_found_or_has_no_effect(
+    small_table_path: Path, make_content: Callable[..., Any], tmp_path: Path
+) -> None:
+    """HDF5's own administration fails in many ways; each is a damaged table, and none changes an answer unseen."""
+    path = tmp_path / "t.h5"
+    make_content(1, num_stations=1, num_levels=1).write(small_table_path)
+    expected = content_of(Table.open(small_table_path))
+    raw = small_table_path.read_bytes()
+    strings = raw.index(b"GCOL")  # HDF5 2.0 hangs on some damages of its heap of strings
+    places = [p for p in range(3, len(raw), 101) if not strings <= p < strings + 4096]
+    found = 0
+    for place in places:
+        changed = bytearray(raw)
+        changed[place] ^= 0x55
+        path.write_bytes(changed)
+        try:
+            table = Table.open(path)
+            table.verify()
+        except TableError as error:
+            assert "\n" not in str(error)
+            assert str(path) in str(error)
+            found += 1
+        else:
+            assert content_of(table) == expected
+    assert found > 0.4 * len(places)
+
+
+@pytest.mark.slow
+def test_the_hall_table_is_whole_and_a_change_is_found(hall_table_copy: Path, hall_table_path: Path) -> None:
+    Table.open(hall_table_path).verify()
+    with h5py.File(hall_table_copy) as file:
+        offset = file["stations/bs2/levels/0/u_cov"].id.get_offset()
+    with hall_table_copy.open("r+b") as file:
+        file.seek(offset + 4)
+        byte = file.read(1)[0]
+        file.seek(offset + 4)
+        file.write(bytes([byte ^ 1]))
+    table = Table.open(hall_table_copy)
+    with pytest.raises(CorruptTableError, match="the checksum of stations/bs2/levels/0/u_cov does not match"):
+        table.verify()
+    shutil.copy(hall_table_path, hall_table_copy)
+    Table.open(hall_table_copy).verify()

@@ -1,0 +1,243 @@
+"""A table that is written and opened again is the same table, bit for bit."""
+
+import json
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.grid import AngularGrid
+from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
+from rayfix_tables.schema import FORMAT_VERSION
+from rayfix_tables.site import Station
+from rayfix_tables.table import Table
+
+DEGREES = 1e-14  # relative; angles are stored in degrees
+
+
+def assert_same_bits(actual: Any, expected: Any) -> None:
+    """Check shape, type and every bit, so that -0.0 is not 0.0."""
+    assert actual.shape == expected.shape
+    assert actual.dtype == expected.dtype
+    assert actual.tobytes() == expected.tobytes()
+
+
+def assert_same_table(table: Table, content: Any) -> None:
+    """Check that a table holds the content that it was written from."""
+    site = content.site
+    assert (table.site.name, table.site.max_path_length) == (site.name, site.max_path_length)
+    assert table.site.document == site.document
+    assert table.site.north == pytest.approx(site.north, rel=DEGREES)
+    assert list(table.parts) == [station.id for station in site.stations]
+    for station, written, part in zip(site.stations, content.stations, table.parts.values(), strict=True):
+        assert part.station.id == station.id
+        assert part.station.position == station.position
+        assert part.station.orientation == pytest.approx(station.orientation, rel=DEGREES)
+        assert part.station.field_of_view == pytest.approx(station.field_of_view, rel=DEGREES)
+        assert (part.lost_ray_share, part.coverage) == (written.lost_ray_share, written.coverage)
+        assert table.levels(station.id) is part.levels
+        for level, expected in zip(part.levels, written.levels, strict=True):
+            assert level.window == pytest.approx(expected.window, rel=DEGREES)
+            assert (level.num_cells, level.num_components) == (expected.grid.num_cells, len(expected.mixture))
+            assert_same_bits(level.grid.ring_cells, expected.grid.ring_cells)
+            assert_same_bits(level.cell_offsets, expected.cell_offsets)
+            assert_same_bits(level.cell_log_mass, expected.cell_log_mass)
+            for name in FIELD_SHAPES:
+                assert_same_bits(getattr(level.mixture, name), getattr(expected.mixture, name))
+    scene = content.scene
+    assert (table.scene.materials, table.scene.sha256) == (scene.materials, scene.sha256)
+    for name in ("vertices", "faces", "face_materials"):
+        assert_same_bits(getattr(table.scene, name), getattr(scene, name))
+    assert_same_bits(table.scene.free_space.free, scene.free_space.free)
+    assert_same_bits(table.scene.free_space.origin, scene.free_space.origin)
+    assert table.scene.free_space.voxel_size == scene.free_space.voxel_size
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    num_stations=st.integers(1, 3),
+    num_levels=st.integers(1, 3),
+    num_faces=st.integers(1, 50),
+    max_components=st.integers(0, 4),
+)
+def test_round_trip(
+    make_content: Callable[..., Any],
+    tmp_path_factory: pytest.TempPathFactory,
+    seed: int,
+    num_stations: int,
+    num_levels: int,
+    num_faces: int,
+    max_components: int,
+) -> None:
+    path = tmp_path_factory.mktemp("tables") / "table.h5"
+    content = make_content(
+        seed,
+        num_stations=num_stations,
+        num_levels=num_levels,
+        num_faces=num_faces,
+        max_components=max_components,
+    )
+    table_id = content.write(path)
+    table = Table.open(path)
+    assert_same_table(table, content)
+    assert table.table_id == table_id
+    assert (table.path, table.format_version, table.software_version) == (path, FORMAT_VERSION, "1.2.3")
+    table.verify()
+    assert [entry.name for entry in path.parent.iterdir()] == ["table.h5"]
+
+
+def test_extreme_numbers_come_back(make_content: Callable[..., Any], tmp_path: Path) -> None:
+    content = make_content(0, num_stations=1, num_levels=1)
+    level = content.stations[0].levels[0]
+    extremes = np.array([-0.0, np.inf, -np.inf, np.nan, 1e-45, 3.4e38], np.float32)
+    level.mixture.u_cov[0] = extremes
+    content.write(tmp_path / "t.h5")
+    table = Table.open(tmp_path / "t.h5")
+    assert_same_table(table, content)
+    table.verify()
+
+
+def test_double_precision_is_rounded_to_the_stored_types(make_content: Callable[..., Any], tmp_path: Path) -> None:
+    content = make_content(0, num_stations=1, num_levels=1)
+    level = content.stations[0].levels[0]
+    doubles = {f.name: getattr(level.mixture, f.name) * np.float64(np.pi) for f in fields(level.mixture)}
+    exact = replace(level, mixture=replace(level.mixture, **doubles))
+    replace(content, stations=(replace(content.stations[0], levels=(exact,)),)).write(tmp_path / "t.h5")
+    mixture = Table.open(tmp_path / "t.h5").levels("bs0")[0].mixture
+    for name, dtype in FIELD_DTYPES.items():
+        assert_same_bits(getattr(mixture, name), doubles[name].astype(dtype))
+
+
+def test_a_cell_is_its_slice_of_the_components(make_content: Callable[..., Any], tmp_path: Path) -> None:
+    content = make_content(3, num_stations=1, num_levels=1)
+    content.write(tmp_path / "t.h5")
+    level = Table.open(tmp_path / "t.h5").levels("bs0")[0]
+    written = content.stations[0].levels[0]
+    counts = [len(level.cell(i)) for i in range(level.num_cells)]
+    assert counts == np.diff(written.cell_offsets).tolist()
+    assert 0 in counts
+    joined = np.concatenate([level.cell(i).u_mean for i in range(level.num_cells)])
+    assert_same_bits(joined, written.mixture.u_mean)
+
+
+def test_arrays_are_mapped_and_cannot_be_written(small_table_path: Path) -> None:
+    """A view of the file itself, 64-byte aligned; nothing of it is read in advance."""
+    table = Table.open(small_table_path)
+    raw = small_table_path.read_bytes()
+    with h5py.File(small_table_path) as file:
+        for n, level in enumerate(table.levels("bs0")):
+            for name in FIELD_SHAPES:
+                array = getattr(level.mixture, name)
+                offset = file[f"stations/bs0/levels/{n}/{name}"].id.get_offset()
+                assert offset % 64 == 0
+                assert raw[offset : offset + array.nbytes] == array.tobytes()
+                assert not array.flags.owndata
+                with pytest.raises(ValueError, match="read-only"):
+                    array[0] = 0
+
+
+def test_the_site_is_plain_json(small_table_path: Path, make_content: Callable[..., Any]) -> None:
+    """Other programs can read it."""
+    with h5py.File(small_table_path) as file:
+        assert file.attrs["format"] == "rayfix-table"
+        assert file.attrs["format_version"] == FORMAT_VERSION
+        document = json.loads(file.attrs["site"])
+    site = make_content(1).site
+    assert document["station_ids"] == ["bs0", "bs1"]
+    assert document["north_deg"] == pytest.approx(np.rad2deg(site.north), rel=DEGREES)
+    assert document["document"] == site.document
+
+
+# table_id
+
+
+def test_the_id_does_not_tell_who_wrote_it_where(make_content: Callable[..., Any], tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    first = make_content(5).write(tmp_path / "a.h5", software_version="1.0")
+    second = make_content(5).write(tmp_path / "folder" / "b.h5", software_version="2.0")
+    assert first == second
+    assert len(first) == 64
+    assert Table.open(tmp_path / "a.h5").software_version != Table.open(tmp_path / "folder/b.h5").software_version
+
+
+def nudged(array: np.ndarray) -> np.ndarray:
+    """Change the least bit of one number in the middle."""
+    changed = array.copy()
+    flat = changed.reshape(-1)
+    middle = len(flat) // 2
+    if np.issubdtype(array.dtype, np.floating):
+        flat[middle] = np.nextafter(flat[middle], np.inf, dtype=array.dtype)
+    else:
+        flat[middle] ^= 1
+    return changed
+
+
+def variations(content: Any) -> dict[str, Any]:
+    """Contents that differ in one thing each."""
+    near = 1.0 + 1e-12
+    site, scene, (first, *others) = content.site, content.scene, content.stations
+    level, *coarser = first.levels
+    station, *stations = site.stations
+
+    def with_station(**changes: Any) -> Any:
+        changed = Station(**{**{f.name: getattr(station, f.name) for f in fields(station)}, **changes})
+        return replace(content, site=replace(site, stations=(changed, *stations)))
+
+    def with_level(**changes: Any) -> Any:
+        levels = (replace(level, **changes), *coarser)
+        return replace(content, stations=(replace(first, levels=levels), *others))
+
+    def with_part(**changes: Any) -> Any:
+        return replace(content, stations=(replace(first, **changes), *others))
+
+    def with_scene(**changes: Any) -> Any:
+        return replace(content, scene=replace(scene, **changes))
+
+    space: FreeSpace = scene.free_space
+    x, y, z = station.position
+    varied = {
+        "name": replace(content, site=replace(site, name="other")),
+        "north": replace(content, site=replace(site, north=site.north * near)),
+        "max_path_length": replace(content, site=replace(site, max_path_length=site.max_path_length * near)),
+        "document": replace(content, site=replace(site, document={**site.document, "more": 1})),
+        "station id": with_station(id="other"),
+        "position": with_station(position=(x, y, z * near)),
+        "orientation": with_station(orientation=(0.1, 0.2, 0.3)),
+        "field_of_view": with_station(field_of_view=station.field_of_view * near),
+        "lost_ray_share": with_part(lost_ray_share=first.lost_ray_share * near),
+        "coverage": with_part(coverage=(*first.coverage[:-1], first.coverage[-1] * near)),
+        "no coarse level": with_part(levels=(level,)),
+        "window": with_level(window=level.window * near),
+        "ring_cells": with_level(grid=AngularGrid(ring_cells=level.grid.ring_cells[::-1] + np.arange(20)[-1])),
+        "cell_offsets": with_level(cell_offsets=nudged(level.cell_offsets)),
+        "cell_log_mass": with_level(cell_log_mass=level.cell_log_mass + 1e-12),
+        "vertices": with_scene(vertices=nudged(scene.vertices)),
+        "faces": with_scene(faces=nudged(scene.faces)),
+        "face_materials": with_scene(face_materials=nudged(scene.face_materials)),
+        "materials": with_scene(materials=("itu_concrete", "itu_glass")),
+        "sha256": with_scene(sha256="0" * 64),
+        "free": with_scene(free_space=replace(space, free=~space.free)),
+        "origin": with_scene(free_space=replace(space, origin=nudged(space.origin))),
+        "voxel_size": with_scene(free_space=replace(space, voxel_size=0.2)),
+    }
+    for name in FIELD_SHAPES:
+        mixture = replace(level.mixture, **{name: nudged(getattr(level.mixture, name))})
+        varied[name] = with_level(mixture=mixture)
+    return varied
+
+
+def test_the_id_changes_with_every_part_of_the_content(make_content: Callable[..., Any], tmp_path: Path) -> None:
+    content = make_content(6)
+    ids = {"": content.write(tmp_path / "t.h5")}
+    for name, varied in variations(content).items():
+        ids[name] = varied.write(tmp_path / "t.h5")
+    assert len(set(ids.values())) == len(ids)
+    assert len(ids) == 24 + len(FIELD_SHAPES)
