@@ -39,13 +39,18 @@ def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
         TimeRemainingColumn(),
         console=Console(stderr=True),
     )
-    with bar:
-        task = bar.add_task("starting", total=None)
+    task = bar.add_task("starting", total=None)
 
-        def show(stage: str, done: int, total: int) -> None:
-            bar.update(task, description=stage, completed=done, total=total or None)
+    def show(stage: str, done: int, total: int) -> None:
+        # Until the work is known there is nothing to draw, and a mistake in the site is one line only.
+        if total:
+            bar.start()
+            bar.update(task, description=stage, completed=done, total=total)
 
+    try:
         yield show
+    finally:
+        bar.stop()
 
 
 def print_build_summary(summary: "BuildSummary") -> None:
@@ -67,7 +72,10 @@ def print_build_summary(summary: "BuildSummary") -> None:
             f"{s.lost_ray_share:.3%}",
             *(f"{share:.0%}" for share in s.coverage),
         )
-    grid.caption = "filled: cells that rays come to; lost: rays that left the scene; <= k: share of the free space that at most k reflections reach"
+    grid.caption = (
+        "filled: cells that rays come to; lost: rays that left the scene; "
+        "<= k: share of the free space that at most k reflections reach"
+    )
     console = Console()
     console.print(grid)
     console.print(
@@ -119,7 +127,7 @@ def print_table_info(table: Table) -> None:
         f"scene of {facts['faces']:,} triangles, {facts['free_space_m3']:,.0f} m3 of free space",
     ):
         console.print(line, highlight=False, soft_wrap=True)
-    grid = Grid("station", "position [m]", "window [deg]", "cells", "components")
+    grid = Grid("station", "position, m", "window, deg", "cells", "components")
     for station in facts["stations"]:
         for n, level in enumerate(station["levels"]):
             grid.add_row(

@@ -23,7 +23,7 @@ LENGTH_FLOOR = 0.05
 """Standard deviation that every component has at least along its tube, m."""
 
 NUM_SUMS = 28
-"""Sums of a group: six of mass (1, a, a a), twelve of mass x length (1, a, d, d a), ten of mass x length^2 (1, d, d d)."""
+"""Sums of a group: 6 of mass (1, a, a a), 12 of mass x length (1, a, d, d a), 10 of mass x length^2 (1, d, d d)."""
 
 
 @numba.njit(cache=True, nogil=True)

@@ -95,14 +95,14 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
         transform, name = loaded.graph[node]
         geometry = loaded.geometry[name]
         if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+            if not (np.all(np.isfinite(geometry.vertices)) and np.all(np.isfinite(transform))):
+                raise SceneError(f"{path} has coordinates that are not finite; export the scene again")
             meshes.append((str(node), geometry, transform))
     if not meshes:
         raise SceneError(f"{path} holds no triangles; export the scene as a triangle mesh")
     # trimesh reads the unit of a COLLADA file (as "0.01 * meters"), but does not apply it.
     scale = float(unit_conversion(loaded.units, "meters")) if kind == "dae" else METRES_PER_UNIT[unit]
     scene = _gather(meshes, scale=scale, up=up)
-    if not np.all(np.isfinite(scene.vertices)):
-        raise SceneError(f"{path} has coordinates that are not finite; export the scene again")
     if not len(scene.faces):
         raise SceneError(f"{path} has only triangles without an area; export the scene again")
     return scene

@@ -43,16 +43,14 @@ class PropagationSection(_Section):
 class TableSection(_Section):
     """``[table]``: how finely the table is cut."""
 
-    windows_deg: Annotated[tuple[Annotated[float, Field(ge=0.1, le=30)], ...], Field(min_length=1)] = (
-        1.25,
-        5.0,
-        15.0,
-    )
+    windows_deg: tuple[Annotated[float, Field(ge=0.1, le=30)], ...] = (1.25, 5.0, 15.0)
     fit: Literal["tubes", "em"] = "tubes"
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
 
     @model_validator(mode="after")
     def _windows_ascend(self) -> "TableSection":
+        if not self.windows_deg:
+            raise ValueError("windows_deg must name at least one window, e.g. [1.25, 5.0, 15.0]")
         if any(b <= a for a, b in zip(self.windows_deg, self.windows_deg[1:], strict=False)):
             raise ValueError("windows_deg must grow from each window to the next, e.g. [1.25, 5.0, 15.0]")
         return self
@@ -73,11 +71,13 @@ class SiteFile(_Section):
     site: SiteSection
     propagation: PropagationSection = PropagationSection()
     table: TableSection = TableSection()
-    stations: Annotated[tuple[StationSection, ...], Field(min_length=1)]
+    stations: tuple[StationSection, ...]
 
     @model_validator(mode="after")
     def _ids_differ(self) -> "SiteFile":
         ids = [station.id for station in self.stations]
+        if not ids:
+            raise ValueError("stations must name at least one; add a [[stations]] section")
         twice = sorted({i for i in ids if ids.count(i) > 1})
         if twice:
             raise ValueError(f"station ids must differ; more than one station is called {', '.join(twice)}")

@@ -1,5 +1,6 @@
 """Write table files: beside the final name, checksummed, synced, then renamed into place."""
 
+import contextlib
 import io
 import json
 import os
@@ -135,26 +136,11 @@ def write_table(
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
         with _Sink(partial, "w+") as sink:
-            with h5py.File(sink, "w", alignment_threshold=1, alignment_interval=64) as file:
-                _write_scene(file, scene)
-                for station, content in zip(site.stations, stations, strict=True):
-                    group = file.create_group(f"stations/{station.id}")
-                    group.attrs["position_m"] = np.asarray(station.position)
-                    group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
-                    group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
-                    group.attrs["lost_ray_share"] = content.lost_ray_share
-                    group.attrs["coverage"] = np.asarray(content.coverage)
-                    for n, level in enumerate(content.levels):
-                        _write_level(file.create_group(level_path(station.id, n)), level)
-                file.attrs["format"] = FORMAT
-                file.attrs["format_version"] = FORMAT_VERSION
-                file.attrs["software_version"] = software_version
-                file.attrs["scene_sha256"] = scene.sha256
-                file.attrs["site"] = json.dumps(_site_document(site), sort_keys=True)
-                digests = {name: str(file[name].attrs["sha256"]) for name in dataset_paths(file)}
-                table_id = content_id(content_attributes(file), digests)
-                file.attrs["table_id"] = table_id
-            sink.raise_failure()
+            try:
+                with h5py.File(sink, "w", alignment_threshold=1, alignment_interval=64) as file:
+                    table_id = _write_content(file, site, scene, stations, software_version)
+            finally:
+                sink.raise_failure()
             os.fsync(sink.fileno())
         partial.replace(path)
         folder = os.open(path.parent, os.O_RDONLY)
@@ -167,7 +153,8 @@ def write_table(
             f"cannot write {path}: {_first_line(error)}; free some space or choose another folder"
         ) from error
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink()
     return table_id
 
 
@@ -204,6 +191,34 @@ class _Sink(io.FileIO):
         """Raise the first failure."""
         if self._failure is not None:
             raise self._failure
+
+
+def _write_content(
+    file: h5py.File,
+    site: SiteInfo,
+    scene: SceneContent,
+    stations: Sequence[StationContent],
+    software_version: str,
+) -> str:
+    _write_scene(file, scene)
+    for station, content in zip(site.stations, stations, strict=True):
+        group = file.create_group(f"stations/{station.id}")
+        group.attrs["position_m"] = np.asarray(station.position)
+        group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
+        group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
+        group.attrs["lost_ray_share"] = content.lost_ray_share
+        group.attrs["coverage"] = np.asarray(content.coverage)
+        for n, level in enumerate(content.levels):
+            _write_level(file.create_group(level_path(station.id, n)), level)
+    file.attrs["format"] = FORMAT
+    file.attrs["format_version"] = FORMAT_VERSION
+    file.attrs["software_version"] = software_version
+    file.attrs["scene_sha256"] = scene.sha256
+    file.attrs["site"] = json.dumps(_site_document(site), sort_keys=True)
+    digests = {name: str(file[name].attrs["sha256"]) for name in dataset_paths(file)}
+    table_id = content_id(content_attributes(file), digests)
+    file.attrs["table_id"] = table_id
+    return table_id
 
 
 def _write_scene(file: h5py.File, scene: SceneContent) -> None:

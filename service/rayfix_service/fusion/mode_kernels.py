@@ -34,8 +34,6 @@ def cut_gaussians(mean: Any, cov: Any, points: Any, origin: Any, voxel_size: Any
         first[:] = 0.0
         second[:] = 0.0
         for n in range(len(points)):
-            inside = True
-            index = (0, 0, 0)
             for i in range(3):
                 apart[i] = 0.0
                 for j in range(i + 1):

@@ -131,7 +131,8 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
                 if row.index is None:
                     drafts[row.station_id].reference_of += near_indices
             num_clocks += 1
-            unused.update({row.index: _FAR for row in clock if row.index not in (None, *near_indices)})
+            left_out = {row.index for row in clock if row.index is not None}.difference(near_indices)
+            unused.update(dict.fromkeys(left_out, _FAR))
         else:
             alone = len({row.station_id for row in clock}) == 1
             unused.update({row.index: _ALONE if alone else _FAR for row in clock if row.index is not None})
@@ -142,7 +143,7 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
 
 
 def _on_one_clock(reference: str, differences: list[_Arrival]) -> list[_Arrival]:
-    """Times of arrival that have these differences to the reference's."""
+    """Turn differences to one reference into times of arrival."""
     shared = 0.5 * min(row.variance for row in differences)
     return [
         _Arrival(index=None, station_id=reference, offset=0.0, variance=shared),
@@ -151,7 +152,7 @@ def _on_one_clock(reference: str, differences: list[_Arrival]) -> list[_Arrival]
 
 
 def _near_each_other(clock: list[_Arrival], max_path_length: float) -> list[_Arrival]:
-    """Times of arrival counted from their middle, without those that are farther from it than paths can make them.
+    """Count times of arrival from their middle and leave out those farther from it than paths can make them.
 
     Counted so, the clock's offset is a mere path length whatever the clock shows, and squares keep their precision.
     """
@@ -229,7 +230,10 @@ def _observations(station_id: str, draft: _Draft) -> list[Observation]:
                 lengths=tuple((length, variance) for _, length, variance in lengths),
                 readings=tuple(reading for _, reading in readings),
                 angle_index=angle[0] if angle else None,
-                timing_indices=tuple(i for i, *_ in [*lengths, *readings] if i is not None),
+                timing_indices=(
+                    *(i for i, *_ in lengths),
+                    *(i for i, _ in readings if i is not None),
+                ),
                 reference_of=tuple(draft.reference_of) if k == 0 else (),
             )
         )

@@ -1,0 +1,87 @@
+"""The Python interface, and that packages keep to their layer."""
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rayfix
+from rayfix.example.drop import example_paths, report_text, simulate_example_report
+from rayfix.example.files import example_report
+
+ROOT = Path(__file__).resolve().parents[2]
+
+MAY_IMPORT = {
+    "tables/rayfix_tables": {"rayfix_tables"},
+    "offline/rayfix_offline": {"rayfix_tables", "rayfix_offline"},
+    "service/rayfix_service": {"rayfix_tables", "rayfix_service"},
+    "rayfix": {"rayfix_tables", "rayfix_offline", "rayfix_service", "rayfix"},
+}
+
+
+def test_everything_in_all_can_be_imported() -> None:
+    for name in rayfix.__all__:
+        assert getattr(rayfix, name) is not None
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        rayfix.nothing  # noqa: B018
+
+
+def test_a_locator_takes_a_dict_or_a_report(hall_table_path: Path) -> None:
+    document = json.loads(example_report())
+    locator = rayfix.Locator(rayfix.Table.open(hall_table_path))
+    from_dict = locator.locate(document)
+    assert from_dict.position is not None
+    assert from_dict.target_id == "agv-7"
+    document["measurements"][0]["azimuth_deg"] = 720.0
+    with pytest.raises(rayfix.RayfixError, match="720"):
+        locator.locate(document)
+
+
+def test_build_writes_beside_the_site_file(hall_site_path: Path, tmp_path: Path) -> None:
+    text = hall_site_path.read_text(encoding="utf-8").replace("[2.5, 10]", "[15.0]")
+    (tmp_path / "site.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "hall.glb").write_bytes((hall_site_path.parent / "hall.glb").read_bytes())
+    table = rayfix.build(tmp_path / "site.toml")
+    assert table.path == tmp_path / "site.h5"
+    table.verify()
+    assert [round(float(np.rad2deg(level.window)), 6) for level in table.levels("bs1")] == [15.0]
+
+
+def test_the_bundled_report_is_what_the_forward_solver_gives() -> None:
+    assert example_report() == report_text(simulate_example_report(example_paths()))
+
+
+@pytest.mark.parametrize("folder", MAY_IMPORT)
+def test_packages_import_only_what_they_build_on(folder: str) -> None:
+    ours = set().union(*MAY_IMPORT.values())
+    files = sorted((ROOT / folder).rglob("*.py"))
+    assert files
+    for file in files:
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            for name in names:
+                package = name.split(".")[0]
+                assert package not in ours or package in MAY_IMPORT[folder], f"{file} imports {name}"
+
+
+def test_a_missing_extra_is_named() -> None:
+    script = (
+        "import sys\n"
+        "sys.modules['fastapi'] = sys.modules['numba'] = sys.modules['trimesh'] = None\n"
+        "from rayfix.cli import main\n"
+        "import rayfix\n"
+        "print(main(['example', 'never']), main(['serve', 'never.h5']))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=100, check=True)
+    assert done.stdout.strip() == "2 2"
+    first, second = done.stderr.strip().splitlines()
+    assert first.endswith("is not installed; install it with: pip install 'rayfix[offline]'")
+    assert second.endswith("is not installed; install it with: pip install 'rayfix[service]'")

@@ -1,0 +1,172 @@
+"""The command line: every command on the small table, and every mistake with its one line."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rayfix.cli import main
+from rayfix.example.drop import EXAMPLE_POSITION
+from rayfix_tables.table import Table
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
+    """Run a command; return its exit status and what it printed."""
+    capsys.readouterr()
+    try:
+        status = main([str(a) for a in arguments])
+    except SystemExit as stop:
+        status = int(stop.code or 0)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def one_line(text: str) -> str:
+    """Return the only line of a message."""
+    lines = text.strip().splitlines()
+    assert len(lines) == 1, text
+    return lines[0]
+
+
+def test_example_check_build_info_verify_locate(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, hall_table_path: Path
+) -> None:
+    status, out, err = run(capsys, "example", tmp_path / "hall")
+    assert (status, err) == (0, "")
+    assert {p.name for p in (tmp_path / "hall").iterdir()} == {"hall.glb", "site.toml", "report.json"}
+    assert str(tmp_path / "hall" / "site.toml") in out
+
+    status, out, err = run(capsys, "check", tmp_path / "hall" / "site.toml")
+    assert (status, err) == (0, "")
+    assert "8 x 18 x 2.5 m" in out
+    assert "0 errors, 0 warnings" in out
+
+    status, out, err = run(capsys, "info", hall_table_path, "--json")
+    assert status == 0
+    facts = json.loads(out)
+    assert [station["id"] for station in facts["stations"]] == ["bs1", "bs2", "bs3", "bs4"]
+    assert facts["table_id"] == Table.open(hall_table_path).table_id
+    assert run(capsys, "info", hall_table_path)[0] == 0
+
+    status, out, _ = run(capsys, "verify", hall_table_path)
+    assert status == 0
+    assert facts["table_id"] in out
+
+    status, out, _ = run(capsys, "locate", hall_table_path, tmp_path / "hall" / "report.json", "--json")
+    assert status == 0
+    answer = json.loads(out)
+    position = [answer["position"][axis] for axis in "xyz"]
+    assert answer["status"] == "ok"
+    # The report's noise alone, 1 deg and 0.5 m, moves the fix by some 0.2 m.
+    assert np.linalg.norm(np.subtract(position, EXAMPLE_POSITION)) < 0.5
+    status, out, _ = run(capsys, "locate", hall_table_path, tmp_path / "hall" / "report.json")
+    assert status == 0
+    assert re.match(r"ok: \(\d+\.\d\d, \d+\.\d\d, \d+\.\d\d\) m\n", out)
+
+
+def test_build_writes_a_table_and_a_summary(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    run(capsys, "example", tmp_path)
+    site = tmp_path / "site.toml"
+    text = site.read_text(encoding="utf-8")
+    text = text.replace("[1.25, 5, 15]", "[10.0]").replace("max_reflections = 3", "max_reflections = 1")
+    site.write_text(text, encoding="utf-8")
+    status, out, err = run(capsys, "build", site, "-o", tmp_path / "t.h5", "--no-progress")
+    assert (status, err) == (0, "")
+    assert Table.open(tmp_path / "t.h5").table_id in out
+    assert out.count("bs") == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["info", "{tmp}/none.h5"], r"there is no table at .*none\.h5; build one with 'rayfix build"),
+        (["verify", "{tmp}"], r"is not a rayfix table"),
+        (["build", "{tmp}/none.toml", "-o", "{tmp}/t.h5"], r"there is no site file at .*none\.toml"),
+        (["check", "{tmp}/none.toml"], r"there is no site file at .*none\.toml"),
+        (["build", "{site}", "-o", "{tmp}/no/such/t.h5"], r"there is no folder .*no/such; create it first"),
+        (["build", "{site}", "-o", "{tmp}/t.h5", "--jobs", "0"], r"--jobs: 0 is not a number of jobs"),
+        (["locate", "{table}", "{tmp}/none.json"], r"none\.json cannot be read"),
+        (["serve", "{tmp}/none.h5"], r"there is no table at"),
+        (["serve", "{table}", "--workers", "0"], r"workers is 0; give at least 1"),
+        (["frobnicate"], r"invalid choice: 'frobnicate'"),
+        ([], r"required: COMMAND"),
+        (["build", "{site}"], r"required: -o/--output"),
+    ],
+)
+def test_mistakes_are_one_line_and_status_2(
+    arguments: list[str],
+    expected: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    hall_site_path: Path,
+    hall_table_path: Path,
+) -> None:
+    places = {"tmp": str(tmp_path), "site": str(hall_site_path), "table": str(hall_table_path)}
+    status, out, err = run(capsys, *(a.format(**places) for a in arguments))
+    assert (status, out) == (2, "")
+    assert re.search(expected, one_line(err))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        ("", r"report\.json: .*JSON"),
+        ('{"measurements": []}', r"report\.json: .*measurements"),
+        (
+            '{"measurements": [{"type": "pt", "station_id": "bs9", "range_m": 5, "stdev_m": 1}]}',
+            r"report\.json: .*'bs9'.*bs1",
+        ),
+    ],
+)
+def test_locate_names_what_is_wrong_with_a_report(
+    body: str, expected: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, hall_table_path: Path
+) -> None:
+    report = tmp_path / "report.json"
+    report.write_text(body, encoding="utf-8")
+    status, _, err = run(capsys, "locate", hall_table_path, report)
+    assert status == 2
+    assert re.search(expected, one_line(err))
+
+
+def test_check_lists_all_problems_at_once(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    run(capsys, "example", tmp_path)
+    site = tmp_path / "site.toml"
+    text = site.read_text(encoding="utf-8")
+    text = text.replace("[0.1, 0.1, 2.4]", "[1.9, 1.9, 1.0]").replace("[7.9, 0.1, 2.4]", "[9.0, 0.1, 2.4]")
+    site.write_text(text, encoding="utf-8")
+    status, out, _ = run(capsys, "check", site)
+    assert status == 2
+    assert "error: station 'bs1' at (1.9, 1.9, 1) m lies inside the solid 'machine_1'; move it into free space" in out
+    assert "error: station 'bs2' at (9, 0.1, 2.4) m lies outside the scene" in out
+    assert "2 errors" in out
+    status, _, err = run(capsys, "build", site, "-o", tmp_path / "t.h5", "--no-progress")
+    assert status == 2
+    assert "machine_1" in one_line(err)
+    assert "bs2" in err
+    assert not (tmp_path / "t.h5").exists()
+
+
+def test_an_interrupted_build_leaves_the_former_table(tmp_path: Path, hall_table_path: Path) -> None:
+    main(["example", str(tmp_path / "site")])
+    table = Path(shutil.copy(hall_table_path, tmp_path / "t.h5"))
+    before = table.read_bytes()
+    script = (
+        "import signal, sys, threading, os\n"
+        "from rayfix.cli import main\n"
+        "threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    arguments = ["build", str(tmp_path / "site" / "site.toml"), "-o", str(table), "--no-progress"]
+    done = subprocess.run(
+        [sys.executable, "-c", script, *arguments], capture_output=True, text=True, timeout=100, check=False
+    )
+    assert done.returncode == 130, done.stderr
+    assert one_line(done.stderr) == "rayfix: interrupted; nothing half done was left behind"
+    assert table.read_bytes() == before
+    assert {p.name for p in tmp_path.iterdir()} == {"site", "t.h5"}

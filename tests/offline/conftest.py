@@ -1,0 +1,152 @@
+"""Small scenes, and rays launched in them."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from rayfix_offline.engine import EmbreeEngine
+from rayfix_offline.launch import Segments, launch
+from rayfix_offline.planes import merge_coplanar
+
+ROOM = ((0.0, 0.0, 0.0), (4.0, 5.0, 3.0))
+CABINET = ((0.5, 1.0, 0.0), (1.3, 2.2, 1.8))
+TABLE = ((2.4, 2.8, 0.9), (3.4, 4.1, 1.1))
+
+
+def box_triangles(low: ArrayLike, high: ArrayLike) -> NDArray[np.float64]:
+    """Triangles of an axis-aligned box, shape (12, 3, 3), m; they face outwards."""
+    return np.array(trimesh.creation.box(bounds=[low, high]).triangles)
+
+
+@pytest.fixture(scope="session")
+def box() -> Callable[..., NDArray[np.float64]]:
+    """Return the function that makes the triangles of a box."""
+    return box_triangles
+
+
+@pytest.fixture(scope="session")
+def room() -> NDArray[np.float64]:
+    """Triangles of the empty room, 4 x 5 x 3 m."""
+    return box_triangles(*ROOM)
+
+
+@pytest.fixture(scope="session")
+def clutter() -> NDArray[np.float64]:
+    """Triangles of the room with a cabinet and a table top.
+
+    ::
+
+        y = 5 +-----------------+
+              |          +---+  |      table, z from 0.9 to 1.1
+              |          |   |  |
+              |          +---+  |
+              |   +--+          |
+              |   |  |          |      cabinet, z from 0.0 to 1.8
+              |   +--+          |
+        y = 0 +-----------------+
+            x = 0               4
+    """
+    return np.concatenate([box_triangles(*ROOM), box_triangles(*CABINET), box_triangles(*TABLE)])
+
+
+@pytest.fixture(scope="session")
+def launch_in() -> Callable[..., Segments]:
+    """Return a function that launches rays among triangles."""
+
+    def run(
+        triangles: NDArray[np.float64],
+        station: ArrayLike,
+        directions: NDArray[np.float64],
+        *,
+        max_reflections: int = 3,
+        max_path_length: float = 1000.0,
+    ) -> Segments:
+        corners = triangles.reshape(-1, 3)
+        return launch(
+            np.asarray(station, dtype=np.float64),
+            directions,
+            engine=EmbreeEngine(triangles),
+            planes=merge_coplanar(triangles),
+            bounds=np.stack([corners.min(axis=0), corners.max(axis=0)]),
+            max_reflections=max_reflections,
+            max_path_length=max_path_length,
+        )
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def unit_vectors() -> Callable[[int, int], NDArray[np.float64]]:
+    """Return a function that draws isotropic directions, shape (count, 3)."""
+
+    def draw(count: int, seed: int) -> NDArray[np.float64]:
+        vectors = np.random.default_rng(seed).normal(size=(count, 3))
+        return vectors / np.linalg.norm(vectors, axis=1)[:, None]
+
+    return draw
+
+
+def room_scene() -> trimesh.Scene:
+    """Give the room with its cabinet and its table as named objects; the room's triangles face inwards."""
+    scene = trimesh.Scene()
+    walls = trimesh.creation.box(bounds=ROOM)
+    walls.invert()
+    for name, mesh in [
+        ("room", walls),
+        ("cabinet", trimesh.creation.box(bounds=CABINET)),
+        ("table", trimesh.creation.box(bounds=TABLE)),
+    ]:
+        scene.add_geometry(mesh, geom_name=name, node_name=name)
+    return scene
+
+
+@pytest.fixture
+def cluttered_scene() -> trimesh.Scene:
+    """Return the room with its cabinet and its table, for the test to change."""
+    return room_scene()
+
+
+@pytest.fixture(scope="session")
+def site_document() -> Callable[..., dict[str, Any]]:
+    """Return a function that gives a site file's content; sections are updated by what is passed."""
+
+    def make(**sections: Any) -> dict[str, Any]:
+        document: dict[str, Any] = {
+            "site": {"name": "room", "scene": "room.glb"},
+            "propagation": {"max_reflections": 1, "max_path_length_m": 30.0},
+            "table": {"windows_deg": [10.0]},
+            "stations": [{"id": "bs1", "position_m": [3.6, 0.4, 2.6]}],
+        }
+        for name, section in sections.items():
+            document[name] = {**document[name], **section} if isinstance(section, dict) else section
+        return document
+
+    return make
+
+
+def as_toml(document: dict[str, Any]) -> str:
+    """Write a site document as TOML; its strings, numbers and lists look alike in both."""
+
+    def entries(section: dict[str, Any]) -> str:
+        return "".join(f"{key} = {value!r}\n" for key, value in section.items())
+
+    text = "".join(f"[{name}]\n{entries(document[name])}" for name in ("site", "propagation", "table"))
+    return text + "".join(f"[[stations]]\n{entries(station)}" for station in document["stations"])
+
+
+@pytest.fixture(scope="session")
+def write_site(site_document: Callable[..., dict[str, Any]]) -> Callable[..., Path]:
+    """Return a function that writes the cluttered room and its site file into a folder."""
+
+    def write(folder: Path, *, scene: trimesh.Scene | None = None, **sections: Any) -> Path:
+        (folder / "room.glb").write_bytes((scene or room_scene()).export(file_type="glb"))
+        path = folder / "site.toml"
+        path.write_text(as_toml(site_document(**sections)), encoding="utf-8")
+        return path
+
+    return write

@@ -1,0 +1,228 @@
+"""The site file: every mistake is found, named by its path, in one line."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rayfix_offline.site import parse_site, read_site
+from rayfix_tables.errors import SiteError
+
+Document = Callable[..., dict[str, Any]]
+
+
+def refused(document: dict[str, Any]) -> str:
+    """Check that a document is refused in one line and return that line."""
+    with pytest.raises(SiteError) as caught:
+        parse_site(document, source="here.toml")
+    message = str(caught.value)
+    assert message.startswith("here.toml: ")
+    assert "\n" not in message
+    return message.removeprefix("here.toml: ")
+
+
+def test_the_shortest_site_has_the_documented_defaults() -> None:
+    site = parse_site({"site": {"name": "a", "scene": "a.glb"}, "stations": [{"id": "s", "position_m": [1, 2, 3]}]})
+    assert site.model_dump(mode="json") == {
+        "site": {"name": "a", "scene": "a.glb", "scene_unit": "m", "scene_up": "z", "north_deg": 90.0},
+        "propagation": {
+            "carrier_ghz": 3.5,
+            "max_reflections": 3,
+            "max_path_length_m": 60.0,
+            "reflection_loss_db": 6.0,
+            "path_prior": "power",
+            "path_prior_exponent": 2.0,
+        },
+        "table": {"windows_deg": [1.25, 5.0, 15.0], "fit": "tubes", "seed": 1},
+        "stations": [
+            {"id": "s", "position_m": [1, 2, 3], "orientation_deg": [0, 0, 0], "field_of_view_deg": 360.0},
+        ],
+    }
+
+
+def test_the_table_gets_radians(site_document: Document) -> None:
+    document = site_document(site={"north_deg": -30.0})
+    document["stations"][0] |= {"orientation_deg": [90, 10, -45], "field_of_view_deg": 120}
+    site = parse_site(document)
+    info = site.info()
+    assert info.north == pytest.approx(-np.pi / 6, rel=1e-15)
+    assert (info.name, info.max_path_length) == ("room", 30.0)
+    (station,) = info.stations
+    assert station.id == "bs1"
+    assert station.position == (3.6, 0.4, 2.6)
+    assert station.orientation == pytest.approx((np.pi / 2, np.pi / 18, -np.pi / 4), rel=1e-15)
+    assert station.field_of_view == pytest.approx(2 * np.pi / 3, rel=1e-15)
+    assert info.document == site.model_dump(mode="json")
+    assert parse_site(info.document) == site
+
+
+@pytest.mark.parametrize(
+    ("section", "label", "sibling"),
+    [("site", "[site]", "scene_unit"), ("propagation", "[propagation]", "carrier_ghz"), ("table", "[table]", "seed")],
+)
+def test_an_unknown_key(site_document: Document, section: str, label: str, sibling: str) -> None:
+    message = refused(site_document(**{section: {"colour": 1}}))
+    assert message.startswith(f"unknown key {section}.colour; {label} knows ")
+    assert sibling in message
+
+
+def test_an_unknown_key_of_a_station(site_document: Document) -> None:
+    document = site_document()
+    document["stations"].append({"id": "bs2", "position_m": [1, 1, 1], "positon_m": [1, 1, 1]})
+    expected = "id, position_m, orientation_deg, field_of_view_deg"
+    assert refused(document) == f"unknown key stations[1].positon_m; [stations] knows {expected}"
+
+
+def test_an_unknown_section(site_document: Document) -> None:
+    message = refused({**site_document(), "colours": {}})
+    assert message == "unknown key colours; the file knows site, propagation, table, stations"
+
+
+@pytest.mark.parametrize(
+    ("section", "key"), [("site", "name"), ("site", "scene"), ("stations", "id"), ("stations", "position_m")]
+)
+def test_a_missing_key(site_document: Document, section: str, key: str) -> None:
+    document = site_document()
+    part = document[section]
+    path = f"stations[0].{key}" if section == "stations" else f"{section}.{key}"
+    del (part[0] if section == "stations" else part)[key]
+    assert refused(document) == f"{path} is missing"
+
+
+@pytest.mark.parametrize("section", ["site", "stations"])
+def test_a_missing_section(site_document: Document, section: str) -> None:
+    document = site_document()
+    del document[section]
+    assert refused(document) == f"{section} is missing"
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("site.name", ""),
+        ("site.name", 7),
+        ("site.scene", ""),
+        ("site.scene_unit", "yard"),
+        ("site.scene_up", "x"),
+        ("site.north_deg", 361),
+        ("site.north_deg", float("nan")),
+        ("propagation.carrier_ghz", 0),
+        ("propagation.carrier_ghz", float("inf")),
+        ("propagation.max_reflections", -1),
+        ("propagation.max_reflections", 9),
+        ("propagation.max_reflections", 1.5),
+        ("propagation.max_path_length_m", 0),
+        ("propagation.max_path_length_m", "long"),
+        ("propagation.reflection_loss_db", -1),
+        ("propagation.path_prior", "strong"),
+        ("propagation.path_prior_exponent", float("nan")),
+        ("table.windows_deg", 5.0),
+        ("table.windows_deg", [0.05]),
+        ("table.windows_deg", [31]),
+        ("table.windows_deg", [float("nan")]),
+        ("table.fit", "EM"),
+        ("table.seed", -1),
+        ("table.seed", 2**63),
+        ("stations[0].id", ""),
+        ("stations[0].id", "a/b"),
+        ("stations[0].id", "../x"),
+        ("stations[0].id", 1),
+        ("stations[0].position_m", [1, 2]),
+        ("stations[0].position_m", [1, 2, 3, 4]),
+        ("stations[0].position_m", [1, float("inf"), 3]),
+        ("stations[0].position_m", [1, "two", 3]),
+        ("stations[0].orientation_deg", [0, 0, float("nan")]),
+        ("stations[0].field_of_view_deg", 0),
+        ("stations[0].field_of_view_deg", 361),
+        ("site", 5),
+        ("stations", {}),
+    ],
+)
+def test_a_value_that_does_not_fit(site_document: Document, path: str, value: Any) -> None:
+    document = site_document()
+    part: Any = document
+    *parents, key = path.replace("[0]", ".0").split(".")
+    for parent in parents:
+        part = part[int(parent) if parent.isdigit() else parent]
+    part[key] = value
+    message = refused(document)
+    assert message.startswith(path)
+    # One mistake, one problem.
+    assert ";" not in message
+
+
+def test_nothing_of_what_there_must_be_one(site_document: Document) -> None:
+    message = refused(site_document(table={"windows_deg": []}))
+    assert message == "table: windows_deg must name at least one window, e.g. [1.25, 5.0, 15.0]"
+    assert refused(site_document(stations=[])) == "stations must name at least one; add a [[stations]] section"
+
+
+@pytest.mark.parametrize("windows", [[5.0, 5.0], [5.0, 1.0], [1.0, 5.0, 4.0]])
+def test_windows_that_do_not_ascend(site_document: Document, windows: list[float]) -> None:
+    message = refused(site_document(table={"windows_deg": windows}))
+    assert message == "table: windows_deg must grow from each window to the next, e.g. [1.25, 5.0, 15.0]"
+
+
+def test_stations_of_the_same_name(site_document: Document) -> None:
+    stations = [{"id": name, "position_m": [1, 1, 1]} for name in ("b", "a", "b", "c", "a")]
+    message = refused(site_document(stations=stations))
+    assert message == "station ids must differ; more than one station is called a, b"
+
+
+def test_all_problems_at_once(site_document: Document) -> None:
+    document = site_document(site={"scene_up": "x", "colour": 1}, table={"seed": "one"})
+    del document["stations"]
+    message = refused(document)
+    for part in ("site.scene_up = 'x'", "unknown key site.colour", "table.seed = 'one'", "stations is missing"):
+        assert part in message
+
+
+def test_a_file(tmp_path: Path, write_site: Callable[..., Path]) -> None:
+    site = read_site(str(write_site(tmp_path)))
+    assert site.stations[0].position_m == (3.6, 0.4, 2.6)
+
+
+def file_refused(path: Path) -> str:
+    """Check that a file is refused in one line that names it, and return that line."""
+    with pytest.raises(SiteError) as caught:
+        read_site(path)
+    message = str(caught.value)
+    assert str(path) in message
+    assert "\n" not in message
+    return message
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    assert "'rayfix example DIR' writes one" in file_refused(tmp_path / "none.toml")
+
+
+def test_a_folder(tmp_path: Path) -> None:
+    assert "give a TOML site file" in file_refused(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"[site\n", b"name = \n", b"a = 1\na = 2\n"])
+def test_not_toml(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "site.toml"
+    path.write_bytes(content)
+    assert "is not valid TOML" in file_refused(path)
+
+
+def test_not_text(tmp_path: Path) -> None:
+    path = tmp_path / "site.toml"
+    path.write_bytes(b"\x89HDF\r\n\xff\xfe")
+    assert "give a TOML site file" in file_refused(path)
+
+
+def test_an_empty_file(tmp_path: Path) -> None:
+    path = tmp_path / "site.toml"
+    path.touch()
+    message = file_refused(path)
+    assert message == f"{path}: site is missing; stations is missing"
+
+
+def test_problems_of_a_file_name_it(tmp_path: Path) -> None:
+    path = tmp_path / "site.toml"
+    path.write_text('[site]\nname = "a"\nscene = "a.glb"\n')
+    assert file_refused(path) == f"{path}: stations is missing"

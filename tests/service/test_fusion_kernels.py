@@ -1,0 +1,292 @@
+"""The fusion's compiled kernels against their NumPy twins, and the closed forms against sampling."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from rayfix_service.fusion import kernels, mode_kernels, reference
+from rayfix_service.fusion.factors import ALL_GOOD, make_factor
+from rayfix_service.fusion.lookup import WINDOW_RATIO, Direction
+from rayfix_service.fusion.modes import unit_points
+from rayfix_service.fusion.observations import Observation
+from rayfix_service.fusion.settings import FusionSettings
+from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.grid import AngularGrid
+from rayfix_tables.mixture import TubeMixture, pack, unpack
+from rayfix_tables.site import Station
+from rayfix_tables.table import Level, StationPart
+
+Array = NDArray[np.float64]
+Times = tuple[NDArray[np.int64], Array, Array]
+
+LOG_VOLUME, LOG_RANGE = float(np.log(320.0)), float(np.log(60.0))
+
+NO_TIME: Times = (np.empty(0, np.int64), np.empty(0), np.empty(0))
+ONE_TIME: Times = (np.array([0]), np.array([3.0]), np.array([0.25]))
+THREE_TIMES: Times = (np.array([0, 1, 0]), np.array([3.0, -7.5, 3.4]), np.array([0.25, 0.04, 2.0]))
+STATES = [(NO_TIME, 3), (NO_TIME, 4), (ONE_TIME, 4), (ONE_TIME, 5), (THREE_TIMES, 5)]
+"""Times of arrival of a path, and the size of the state: position and 0, 1 or 2 clocks, of which it reads some."""
+
+
+def random_cov(rng: np.random.Generator, count: int, scale: list[float]) -> Array:
+    """Well-conditioned random covariances whose standard deviations are about ``scale``."""
+    size = len(scale)
+    root = rng.standard_normal((count, size, size)) + 1.5 * np.eye(size)
+    return np.asarray(root @ root.transpose(0, 2, 1) * np.multiply.outer(scale, scale))
+
+
+def random_mixture(rng: np.random.Generator, count: int, window: float = 0.05) -> TubeMixture:
+    """Tubes some metres long, as a cell of this window [rad] holds them."""
+    return TubeMixture(
+        log_weight=np.log(rng.dirichlet(np.ones(count))) if count else np.zeros(0),
+        u_mean=rng.normal([8.0, 0.0, 0.0], [3.0, 0.3 * window, 0.3 * window], (count, 3)),
+        u_cov=pack(random_cov(rng, count, [0.8, 0.3 * window, 0.3 * window])),
+        x_mean=rng.uniform([0.0, 0.0, 0.0], [8.0, 18.0, 2.5], (count, 3)),
+        jacobian=rng.standard_normal((count, 3, 3)) * [1.0, 8.0, 8.0],
+        x_cov=pack(random_cov(rng, count, [0.05, 0.05, 0.05])),
+        num_reflections=np.zeros(count, np.int8),
+    )
+
+
+def random_gaussians(rng: np.random.Generator, count: int) -> tuple[Array, Array, Array]:
+    """Log evidences, means and covariances over (x, path length)."""
+    return rng.normal(size=count), rng.normal(0.0, 5.0, (count, 4)), random_cov(rng, count, [0.5, 0.7, 0.2, 0.6])
+
+
+def random_factor(rng: np.random.Generator, count: int, times: Times, dimension: int) -> tuple[Array, Array, Array]:
+    """Alternatives as a report makes them, the last of them an outlier."""
+    information, eta, log_scale = reference.to_information(*random_gaussians(rng, count), *times, dimension)
+    information[-1], eta[-1], log_scale[-1] = 0.0, 0.0, -5.0
+    return information, eta, log_scale
+
+
+def log_integrals(factor: tuple[Array, Array, Array]) -> Array:
+    size = factor[1].shape[1]
+    work, solved = np.empty((size, size)), np.empty(size)
+    return np.array([kernels.log_integral(*f, LOG_VOLUME, LOG_RANGE, work, solved) for f in zip(*factor, strict=True)])
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_condition_on_angle_equals_the_joint_gaussian(dtype: type[np.floating[Any]]) -> None:
+    rng = np.random.default_rng(1)
+    names = ("log_weight", "u_mean", "u_cov", "x_mean", "jacobian", "x_cov")
+    mixture = random_mixture(rng, 10)
+    stored = {name: getattr(mixture, name).astype(dtype) for name in names}
+    mixture = TubeMixture(**stored, num_reflections=mixture.num_reflections)
+    rest_mean = rng.normal(0.0, 0.03, (3, 2))
+    rest_cov = random_cov(rng, 3, [0.02, 0.03])[:, [0, 0, 1], [0, 1, 1]]
+    log_factor = rng.normal(size=3)
+    # Three cells that are not neighbours; the second is empty.
+    begins, ends = np.array([5, 3, 0]), np.array([10, 3, 3])
+    log_evidence, mean, cov = np.empty(8), np.empty((8, 4)), np.empty((8, 4, 4))
+    kernels.condition_on_angle(*stored.values(), begins, ends, rest_mean, rest_cov, log_factor, log_evidence, mean, cov)
+    for cell, out in ((0, slice(0, 5)), (2, slice(5, 8))):
+        expected = reference.condition_on_angle(
+            mixture[begins[cell] : ends[cell]], rest_mean[cell], rest_cov[cell], log_factor[cell]
+        )
+        np.testing.assert_allclose(log_evidence[out], expected[0], rtol=0, atol=1e-10)  # nats
+        np.testing.assert_allclose(mean[out], expected[1], rtol=0, atol=1e-10)  # m
+        np.testing.assert_allclose(cov[out], expected[2], rtol=0, atol=1e-10)  # m2, the least about 1e-2
+
+
+@pytest.mark.parametrize("variance", [1e-6, 0.25, 1e4])
+def test_condition_on_length_equals_the_joint_gaussian(variance: float) -> None:
+    gaussians = random_gaussians(np.random.default_rng(2), 20)
+    expected = reference.condition_on_length(*gaussians, 4.0, variance)
+    kernels.condition_on_length(*gaussians, 4.0, variance)
+    # Evidences of 1e6 nats where a precise length is far off.
+    np.testing.assert_allclose(gaussians[0], expected[0], rtol=1e-11)
+    np.testing.assert_allclose(gaussians[1], expected[1], rtol=0, atol=1e-10)  # m
+    np.testing.assert_allclose(gaussians[2], expected[2], rtol=0, atol=1e-10)  # m2
+
+
+@pytest.mark.parametrize(("times", "dimension"), STATES)
+def test_to_information_equals_its_twin(times: Times, dimension: int) -> None:
+    gaussians = random_gaussians(np.random.default_rng(3), 12)
+    keep = np.array([7, 0, 11])
+    information, eta, log_scale = np.empty((3, dimension, dimension)), np.empty((3, dimension)), np.empty(3)
+    kernels.to_information(keep, *gaussians, *times, information, eta, log_scale)
+    log_evidence, mean, cov = gaussians
+    expected = reference.to_information(log_evidence[keep], mean[keep], cov[keep], *times, dimension)
+    np.testing.assert_allclose(information, expected[0], rtol=1e-9, atol=1e-9)  # 1 / m2
+    np.testing.assert_allclose(eta, expected[1], rtol=1e-9, atol=1e-9)  # 1 / m
+    np.testing.assert_allclose(log_scale, expected[2], rtol=1e-9, atol=1e-9)  # nats
+
+
+def test_to_information_leaves_a_degenerate_gaussian_without_weight() -> None:
+    gaussians = random_gaussians(np.random.default_rng(3), 2)
+    gaussians[2][0, 0, 0] = -1e-9  # m2
+    information, eta, log_scale = np.empty((2, 4, 4)), np.empty((2, 4)), np.empty(2)
+    kernels.to_information(np.arange(2), *gaussians, *ONE_TIME, information, eta, log_scale)
+    assert log_scale[0] == -np.inf
+    assert log_integrals((information, eta, log_scale))[0] == -np.inf
+    log_evidence, mean, cov = gaussians
+    expected = reference.to_information(log_evidence[1:], mean[1:], cov[1:], *ONE_TIME, 4)
+    np.testing.assert_allclose(log_scale[1:], expected[2], rtol=1e-9)
+
+
+def test_to_information_keeps_the_evidence_of_times() -> None:
+    """Of two times of one clock the difference is known: its density remains when position and clock are gone."""
+    rng = np.random.default_rng(4)
+    log_evidence, mean, cov = random_gaussians(rng, 5)
+    times = (np.array([0, 0]), np.array([2.0, 2.7]), np.array([0.3, 0.5]))
+    factor = reference.to_information(log_evidence, mean, cov, *times, 4)
+    log_density = -0.5 * (0.7**2 / 0.8 + np.log(2.0 * np.pi * 0.8))
+    np.testing.assert_allclose(log_integrals(factor), log_evidence + log_density, rtol=0, atol=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), state=st.sampled_from(STATES))
+def test_log_integral_equals_its_twin(seed: int, state: tuple[Times, int]) -> None:
+    factor = random_factor(np.random.default_rng(seed), 6, *state)
+    expected = reference.log_integral(*factor, LOG_VOLUME, LOG_RANGE)
+    np.testing.assert_allclose(log_integrals(factor), expected, rtol=0, atol=1e-8)  # nats
+
+
+def test_log_integral_of_an_outlier_is_the_volume_times_the_clocks_ranges() -> None:
+    factor = np.zeros((1, 5, 5)), np.zeros((1, 5)), np.array([-2.0])
+    assert log_integrals(factor)[0] == pytest.approx(-2.0 + LOG_VOLUME + 2 * LOG_RANGE, abs=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    states=st.sampled_from(
+        [(NO_TIME, NO_TIME, 3), (NO_TIME, ONE_TIME, 4), (ONE_TIME, NO_TIME, 4), (ONE_TIME, THREE_TIMES, 5)]
+    ),
+    wide=st.sampled_from([1.0, 1e7]),
+)
+def test_extend_beam_keeps_the_best_of_all_products(seed: int, states: tuple[Times, Times, int], wide: float) -> None:
+    """Also for times of arrival so noisy (some km) that a product may integrate to more than its parts promise."""
+    rng = np.random.default_rng(seed)
+    first, second, dimension = states
+    hypotheses = random_factor(rng, 12, first, dimension)
+    factor = random_factor(rng, 15, (second[0], second[1], wide * second[2]), dimension)
+    parent, choice, score = kernels.extend_beam(*hypotheses, *factor, 40, LOG_VOLUME, LOG_RANGE)
+    all_parents, all_choices, all_scores = reference.extend_beam(*hypotheses, *factor, LOG_VOLUME, LOG_RANGE)
+    assert len(all_scores) == 12 * 15
+    np.testing.assert_allclose(score, all_scores[:40], rtol=0, atol=1e-7)  # nats
+    clear = np.flatnonzero(-np.diff(all_scores[:41]) > 1e-6)  # before each of these ends a set without ties
+    last = clear[-1] + 1
+    kept = set(zip(parent[:last].tolist(), choice[:last].tolist(), strict=True))
+    assert kept == set(zip(all_parents[:last].tolist(), all_choices[:last].tolist(), strict=True))
+    assert last > 30
+
+
+def test_extend_beam_takes_all_products_when_they_are_few() -> None:
+    rng = np.random.default_rng(5)
+    hypotheses, factor = random_factor(rng, 3, NO_TIME, 3), random_factor(rng, 4, NO_TIME, 3)
+    parent, choice, score = kernels.extend_beam(*hypotheses, *factor, 256, LOG_VOLUME, LOG_RANGE)
+    assert sorted(zip(parent.tolist(), choice.tolist(), strict=True)) == [(h, k) for h in range(3) for k in range(4)]
+    assert (np.diff(score) <= 0.0).all()
+
+
+def test_cut_gaussians_equals_its_twin() -> None:
+    rng = np.random.default_rng(6)
+    free_space = FreeSpace(origin=np.array([-1.0, 2.0, 0.5]), voxel_size=0.25, free=rng.random((10, 8, 6)) < 0.6)
+    mean, cov = rng.uniform([-1.0, 2.0, 0.5], [1.5, 4.0, 2.0], (30, 3)), random_cov(rng, 30, [0.2, 0.1, 0.1])
+    # One Gaussian within a free voxel, one far outside, one of which only a few points are free.
+    corner = free_space.origin + 0.25 * np.argwhere(free_space.free)[0]
+    mean[0], cov[0] = corner + 0.125, 1e-6 * np.eye(3)
+    mean[1] = [50.0, 0.0, 0.0]
+    mean[2], cov[2] = [3.0, 3.0, 1.2], np.eye(3)
+    points = unit_points()
+    expected = [reference.cut_gaussian(m, c, points, free_space) for m, c in zip(mean, cov, strict=True)]
+    share = np.empty(30)
+    mode_kernels.cut_gaussians(mean, cov, points, free_space.origin, 0.25, free_space.free, share)
+    assert share[0] == 1.0
+    assert share[1] == 0.0
+    assert 0 < share[2] * 128 <= 8
+    assert share.tolist() == [e[2] for e in expected]
+    np.testing.assert_allclose(mean, [e[0] for e in expected], rtol=0, atol=1e-12)  # m
+    np.testing.assert_allclose(cov, [e[1] for e in expected], rtol=0, atol=1e-12)  # m2
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_climb_equals_its_twin(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    mean = rng.normal(0.0, 1.0, (20, 3))
+    precision = np.asarray(np.linalg.inv(random_cov(rng, 20, [0.4, 0.6, 0.2])), np.float64)
+    log_density = np.log(rng.dirichlet(np.ones(20))) + 0.5 * np.linalg.slogdet(precision)[1]
+    for start in mean[:5]:
+        mode, curvature = mode_kernels.climb(log_density, mean, precision, start)
+        expected_mode, expected_curvature = reference.climb(log_density, mean, precision, start)
+        np.testing.assert_allclose(mode, expected_mode, rtol=0, atol=1e-7)  # m
+        np.testing.assert_allclose(curvature, expected_curvature, rtol=1e-5)
+
+
+def one_cell_station(mixture: TubeMixture, log_mass: float, cell: int, window: float) -> StationPart:
+    """Station of which only one cell of one level holds anything."""
+    grid = AngularGrid.from_spacing(window / 0.8)
+    offsets, masses = np.zeros(grid.num_cells + 1, np.int64), np.full(grid.num_cells, -np.inf)
+    offsets[cell + 1 :], masses[cell] = len(mixture), log_mass
+    level = Level(window=window, grid=grid, cell_offsets=offsets, cell_log_mass=masses, mixture=mixture)
+    station = Station(id="a", position=(0.0, 0.0, 0.0))
+    return StationPart(station=station, levels=(level,), lost_ray_share=0.0, coverage=(1.0,))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_closed_form_conditioning_agrees_with_sampling(seed: int) -> None:
+    """Points drawn from a cell's mixture, weighted by what was measured, against the alternatives of the report.
+
+    A weighted mean strays by its Monte-Carlo deviation, which the samples themselves tell; five of it are allowed.
+    """
+    rng = np.random.default_rng(seed)
+    window, log_mass, count = 0.05, 1.3, 400_000
+    mixture = random_mixture(rng, 6, window)
+    part = one_cell_station(mixture, log_mass, 300, window)
+    azimuth, zenith = part.levels[0].grid.centres[300]
+    offset = np.array([0.4, -0.3]) * window
+    noise = random_cov(rng, 1, [1.0, 1.0])[0]
+    noise *= (0.9 * window / WINDOW_RATIO) ** 2 / np.linalg.eigvalsh(noise)[-1]
+    stretch = np.diag([1.0 / np.sin(zenith), 1.0])
+    direction = Direction(
+        azimuth=float(azimuth + offset[0] / np.sin(zenith)),
+        zenith=float(zenith + offset[1]),
+        cov=stretch @ noise @ stretch,
+    )
+    length, stdev = float(np.exp(mixture.log_weight) @ mixture.u_mean[:, 0]), 0.5
+    observation = Observation(
+        station_id="a", direction=direction, lengths=((length, stdev**2),), angle_index=0, timing_indices=(1,)
+    )
+    fusion = FusionSettings(component_floor=1e-12)
+    factor = make_factor(observation, part, num_clocks=0, max_path_length=60.0, log_volume=LOG_VOLUME, settings=fusion)
+    assert factor is not None
+    good = factor.outlier == ALL_GOOD
+    log_evidence = log_integrals((factor.information[good], factor.eta[good], factor.log_scale[good]))
+    weight = np.exp(log_evidence - 2.0 * np.log(1.0 - fusion.outlier_probability) - log_mass)
+    cov = np.linalg.inv(factor.information[good])
+    mean = np.einsum("kij,kj->ki", cov, factor.eta[good])
+    closed = weight @ mean / weight.sum()
+    apart = mean - closed
+    closed_cov = np.einsum("k,kij->ij", weight, cov + apart[:, :, None] * apart[:, None, :]) / weight.sum()
+
+    pick = rng.choice(6, count, p=np.exp(mixture.log_weight))
+    u_root, x_root = np.linalg.cholesky(unpack(mixture.u_cov)), np.linalg.cholesky(unpack(mixture.x_cov))
+    du = np.einsum("nij,nj->ni", u_root[pick], rng.standard_normal((count, 3)))
+    u = mixture.u_mean[pick] + du
+    x = mixture.x_mean[pick] + np.einsum("nij,nj->ni", mixture.jacobian[pick], du)
+    x += np.einsum("nij,nj->ni", x_root[pick], rng.standard_normal((count, 3)))
+    # The cell's window is in the mixture already.
+    off = offset - u[:, 1:]
+    log_ratio = -0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(noise), off) - 0.5 * np.log(np.linalg.det(noise))
+    log_ratio += 0.5 * (u[:, 1:] ** 2).sum(axis=1) / window**2 + 2.0 * np.log(window)
+    log_ratio += -0.5 * ((length - u[:, 0]) / stdev) ** 2 - 0.5 * np.log(2.0 * np.pi * stdev**2)
+    drawn = np.exp(log_ratio)
+    share = drawn / drawn.sum()
+    assert 1.0 / (share**2).sum() > 2_000
+
+    assert abs(drawn.mean() - weight.sum()) < 5.0 * drawn.std() / np.sqrt(count)
+    sampled = share @ x
+    error = np.sqrt((share**2) @ (x - sampled) ** 2)
+    assert (np.abs(sampled - closed) < 5.0 * error).all()
+    products = (x - sampled)[:, :, None] * (x - sampled)[:, None, :]
+    sampled_cov = np.einsum("n,nij->ij", share, products)
+    cov_error = np.sqrt(np.einsum("n,nij->ij", share**2, (products - sampled_cov) ** 2))
+    assert (np.abs(sampled_cov - closed_cov) < 5.0 * cov_error).all()
+    # What is compared is much larger than what is allowed: the measurement moves the mean by metres.
+    assert np.linalg.norm(sampled - x.mean(axis=0)) > 50.0 * np.linalg.norm(error)
