@@ -11,6 +11,9 @@ from scipy.spatial import cKDTree
 TOLERANCE = 1e-3
 """Triangles whose planes differ by less than this over the whole scene are coplanar, m."""
 
+ROUNDING = 0.1
+"""Planes are compared to this share of the tolerance."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Planes:
@@ -54,8 +57,10 @@ def merge_coplanar(triangles: NDArray[np.float64], *, tolerance: float = TOLERAN
     # A plane has two normals: both go in, and belong together, so that no sign convention can split a plane.
     features = np.concatenate([normals * radius, offsets[:, None]], axis=1)
     both = np.concatenate([features, -features])
-    rounded, inverse = np.unique(np.round(both / (tolerance * 1e-3)), axis=0, return_inverse=True)
-    pairs = cKDTree(rounded * (tolerance * 1e-3)).query_pairs(tolerance, output_type="ndarray")
+    # Rounded first: the pairs among thousands of triangles of one floor would be millions.
+    step = ROUNDING * tolerance
+    rounded, inverse = np.unique(np.round(both / step), axis=0, return_inverse=True)
+    pairs = cKDTree(rounded * step).query_pairs(tolerance, output_type="ndarray")
     count = len(triangles)
     links = np.concatenate([pairs, np.stack([inverse[:count], inverse[count:]], axis=1)])
     graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(len(rounded), len(rounded)))

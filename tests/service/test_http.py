@@ -536,7 +536,7 @@ def damaged_table_path(hall_table_copy: Path) -> Path:
 
 
 def test_a_damaged_table_is_not_served(damaged_table_path: Path):
-    with pytest.raises(TableError, match=r"copy\.h5: the checksum of scene/vertices_m.*build it again"):
+    with pytest.raises(TableError, match=r"copy\.h5 is damaged: the checksum of scene/vertices_m.*build it again"):
         serve(damaged_table_path)
 
 

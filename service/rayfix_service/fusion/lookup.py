@@ -101,7 +101,8 @@ def look_up(levels: tuple[Level, ...], measured: Direction) -> Lookup:
 
 def _limit(level: Level) -> float:
     """Largest variance that the level's window serves."""
-    return (level.window / WINDOW_RATIO) ** 2
+    # Degrees become radians with rounding: 12 degrees must not just miss a window of 15.
+    return (level.window / WINDOW_RATIO) ** 2 * (1.0 + 1e-9)
 
 
 def _single_cell(level: Level, cell: int, offset: tuple[float, float], noise: tuple[float, float, float]) -> Lookup:

@@ -1,0 +1,200 @@
+"""Look-up: what the cells' windows and the rest of the measurement multiply to."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.lookup import NO_DIRECTION, WINDOW_RATIO, Direction, Lookup, look_up
+from rayfix_tables.angles import wrap
+from rayfix_tables.grid import AngularGrid
+from rayfix_tables.mixture import TubeMixture
+from rayfix_tables.table import Level
+
+Array = NDArray[np.float64]
+
+
+def empty_level(window_deg: float) -> Level:
+    """Make a level as a table has it, but for its components."""
+    window = float(np.deg2rad(window_deg))
+    grid = AngularGrid.from_spacing(window / 0.8)
+    return Level(
+        window=window,
+        grid=grid,
+        cell_offsets=np.zeros(grid.num_cells + 1, np.int64),
+        cell_log_mass=np.full(grid.num_cells, -np.inf),
+        mixture=TubeMixture.empty(),
+    )
+
+
+LEVELS = tuple(empty_level(window) for window in (1.25, 5.0, 15.0))
+
+
+def log_normal(apart: Array, cov: Array) -> Array:
+    """Log density of two-dimensional normals."""
+    det = cov[0, 0] * cov[1, 1] - cov[0, 1] * cov[1, 0]
+    square = cov[1, 1] * apart[:, 0] ** 2 - 2.0 * cov[0, 1] * apart[:, 0] * apart[:, 1] + cov[0, 0] * apart[:, 1] ** 2
+    return np.asarray(-0.5 * square / det - 0.5 * np.log(det) - np.log(2.0 * np.pi))
+
+
+def tangent_to(lookup: Lookup, cell: int, azimuth: Array, zenith: Array) -> Array:
+    """Tangent coordinates of directions about a cell, written out."""
+    centre_azimuth, centre_zenith = lookup.level.grid.centres[cell]
+    turned = (azimuth - centre_azimuth + np.pi) % (2.0 * np.pi) - np.pi
+    return np.stack([np.sin(centre_zenith) * turned, zenith - centre_zenith], axis=-1)
+
+
+def represented(lookup: Lookup, azimuth: Array, zenith: Array) -> Array:
+    """Sum factor x N(.; 0, W) x N(.; a_rest, R_rest) over the cells looked up: what they say of directions."""
+    total = np.zeros(len(azimuth))
+    window = np.eye(2) * lookup.level.window**2
+    for cell, mean, (hh, hv, vv), log_factor in zip(
+        lookup.cells, lookup.rest_mean, lookup.rest_cov, lookup.log_factor, strict=True
+    ):
+        z = tangent_to(lookup, cell, azimuth, zenith)
+        rest = np.array([[hh, hv], [hv, vv]])
+        total += np.exp(log_factor + log_normal(z, window) + log_normal(z - mean, rest))
+    return total
+
+
+def directions(count: int, margin: float) -> tuple[Array, Array]:
+    """Directions spread evenly over the sphere but for caps of this angle [rad] at its poles."""
+    rng = np.random.default_rng(0)
+    return rng.uniform(-np.pi, np.pi, count), np.arccos(rng.uniform(-np.cos(margin), np.cos(margin), count))
+
+
+noise = st.tuples(st.floats(1e-3, 11.9), st.floats(1e-3, 11.9), st.floats(-0.99, 0.99))
+"""Standard deviations of azimuth and zenith, degrees, and their correlation."""
+
+
+def measured(azimuth: float, zenith: float, noise: tuple[float, float, float]) -> Direction:
+    h, v = np.deg2rad(noise[:2])
+    cov = np.array([[h * h, noise[2] * h * v], [noise[2] * h * v, v * v]])
+    return Direction(azimuth=azimuth, zenith=zenith, cov=cov)
+
+
+def widest(level: Level, direction: Direction) -> float:
+    """Largest standard deviation of a measurement in its cell's tangent plane, rad."""
+    assert direction.azimuth is not None
+    assert direction.zenith is not None
+    zenith = level.grid.centres[level.grid.nearest(direction.azimuth, direction.zenith), 1]
+    stretch = np.diag([np.sin(zenith), 1.0])
+    return float(np.sqrt(np.linalg.eigvalsh(stretch @ direction.cov @ stretch)[-1]))
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    azimuth=st.one_of(st.floats(-np.pi, np.pi), st.sampled_from([np.pi, -3.1415926, 0.0])),
+    zenith=st.one_of(st.floats(0.0, np.pi), st.sampled_from([0.0, 1e-9, np.pi])),
+    noise=noise,
+)
+def test_one_cell_represents_the_measurement_exactly(
+    azimuth: float, zenith: float, noise: tuple[float, float, float]
+) -> None:
+    """Also across azimuth +-180 degrees and at the poles."""
+    direction = measured(azimuth, zenith, noise)
+    assume(WINDOW_RATIO * widest(LEVELS[-1], direction) < LEVELS[-1].window)
+    lookup = look_up(LEVELS, direction)
+    assert len(lookup.cells) == 1
+    centre_azimuth, centre_zenith = lookup.level.grid.centres[lookup.cells[0]]
+    stretch = np.diag([np.sin(centre_zenith), 1.0])
+    cov = stretch @ direction.cov @ stretch
+    turned = (azimuth - centre_azimuth + np.pi) % (2.0 * np.pi) - np.pi
+    a = np.array([np.sin(centre_zenith) * turned, zenith - centre_zenith])
+    z = a + np.random.default_rng(0).standard_normal((20, 2)) @ np.linalg.cholesky(cov).T
+    mean, (hh, hv, vv) = lookup.rest_mean[0], lookup.rest_cov[0]
+    product = (
+        lookup.log_factor[0]
+        + log_normal(z, np.eye(2) * lookup.level.window**2)
+        + log_normal(z - mean, np.array([[hh, hv], [hv, vv]]))
+    )
+    np.testing.assert_allclose(product, log_normal(z - a, cov), rtol=0, atol=1e-8)  # relative to the density
+
+
+def test_the_cell_is_the_one_that_holds_the_direction() -> None:
+    """A direction is at most half a cell from the centre, so that the rest of the measurement is near the cell, too."""
+    azimuth, zenith = directions(500, 0.0)
+    for a, z in zip(azimuth, zenith, strict=True):
+        lookup = look_up(LEVELS, measured(float(a), float(z), (0.5, 0.5, 0.0)))
+        apart = tangent_to(lookup, int(lookup.cells[0]), np.array([a]), np.array([z]))[0]
+        # A cell of the last but one ring is a little wider than high.
+        assert np.abs(apart).max() <= 0.5 * lookup.level.window / 0.8 * 1.0001
+        assert np.hypot(*lookup.rest_mean[0]) <= 1.3 * np.hypot(*apart) + 1e-12
+
+
+@settings(max_examples=200, deadline=None)
+@given(azimuth=st.floats(-np.pi, np.pi), zenith=st.floats(0.0, np.pi), noise=noise)
+def test_the_finest_level_that_is_wide_enough_answers(
+    azimuth: float, zenith: float, noise: tuple[float, float, float]
+) -> None:
+    direction = measured(azimuth, zenith, noise)
+    fits = [WINDOW_RATIO * widest(level, direction) / level.window for level in LEVELS]
+    assume(min(abs(np.array(fits) - 1.0)) > 1e-6)
+    lookup = look_up(LEVELS, direction)
+    expected = next((level for level, fit in zip(LEVELS, fits, strict=True) if fit < 1.0), LEVELS[-1])
+    assert lookup.level is expected
+
+
+@pytest.mark.parametrize(("stdev_deg", "window_deg"), [(1.0, 1.25), (1.001, 5.0), (4.0, 5.0), (12.0, 15.0)])
+def test_noise_of_exactly_four_fifths_of_a_window_is_served(stdev_deg: float, window_deg: float) -> None:
+    lookup = look_up(LEVELS, measured(1.0, 0.5 * np.pi, (0.1, stdev_deg, 0.0)))
+    assert np.rad2deg(lookup.level.window) == pytest.approx(window_deg)
+    assert len(lookup.cells) == 1
+
+
+def test_without_an_angle_all_cells_add_up_to_one() -> None:
+    azimuth, zenith = directions(500, np.deg2rad(30.0))
+    lookup = look_up(LEVELS, NO_DIRECTION)
+    assert len(np.unique(lookup.cells)) == lookup.level.num_cells
+    np.testing.assert_allclose(represented(lookup, azimuth, zenith), 1.0, atol=0.03)
+    # No ring lies beyond the poles, so only half as much comes together there.
+    anywhere = represented(lookup, *directions(2000, 0.0))
+    assert 0.5 < anywhere.min() < 0.7
+    assert anywhere.max() < 1.03
+    assert anywhere.mean() == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize("stdev_deg", [1.0, 8.0, 12.5, 15.0, 20.0, 30.0, 60.0])
+@pytest.mark.parametrize("azimuth", [0.3, np.pi])
+def test_an_azimuth_alone_says_the_same_of_every_zenith(stdev_deg: float, azimuth: float) -> None:
+    stdev = np.deg2rad(stdev_deg)
+    around, zenith = directions(2000, np.deg2rad(30.0))
+    apart = wrap(around - azimuth)
+    near = np.abs(apart) < 2.0 * stdev
+    lookup = look_up(LEVELS, Direction(azimuth=azimuth, zenith=None, cov=np.diag([stdev**2, np.inf])))
+    expected = np.exp(-0.5 * (apart / stdev) ** 2) / (np.sqrt(2.0 * np.pi) * stdev)
+    found = represented(lookup, around, zenith)
+    np.testing.assert_allclose(found[near], expected[near], rtol=0.05)
+    assert found.max() < 1.05 * expected.max()
+
+
+@pytest.mark.parametrize(
+    "stdev_deg", [(12.1, 12.1), (14.0, 14.0), (18.0, 18.0), (30.0, 20.0), (60.0, 60.0), (1.0, 20.0), (20.0, 1.0)]
+)
+@pytest.mark.parametrize("azimuth", [0.3, np.pi])
+def test_a_wide_angle_is_a_sum_of_cells(stdev_deg: tuple[float, float], azimuth: float) -> None:
+    """Just above the widest window as well as far above it, and on across azimuth +-180 degrees."""
+    stdev, zenith = np.deg2rad(stdev_deg), 1.4
+    around, up = directions(20_000, np.deg2rad(30.0))
+    apart = np.stack([wrap(around - azimuth), up - zenith], axis=-1)
+    near = ((apart / stdev) ** 2).sum(axis=1) < 4.0
+    assert near.sum() > 50
+    lookup = look_up(LEVELS, Direction(azimuth=azimuth, zenith=zenith, cov=np.diag(stdev**2)))
+    rings = lookup.level.grid.num_rings
+    sine = np.sin((np.floor(zenith * rings / np.pi) + 0.5) * np.pi / rings)
+    # Per steradian.
+    expected = np.exp(log_normal(apart, np.diag(stdev**2))) / sine
+    np.testing.assert_allclose(represented(lookup, around, up)[near], expected[near], rtol=0.08)
+
+
+@pytest.mark.parametrize("zenith", [0.0, 0.02, np.pi])
+@pytest.mark.parametrize("stdev_deg", [0.5, 5.0, 60.0])
+def test_the_poles_are_directions_like_others(zenith: float, stdev_deg: float) -> None:
+    """Seen from straight above, 40 degrees of azimuth are hardly an angle."""
+    lookup = look_up(LEVELS, measured(1.0, zenith, (40.0, stdev_deg, 0.0)))
+    rings = np.searchsorted(lookup.level.grid.ring_offsets, lookup.cells, side="right") - 1
+    last = lookup.level.grid.num_rings - 1
+    assert (0 if zenith < 1.0 else last) in rings
+    assert all(np.isfinite(field).all() for field in (lookup.rest_mean, lookup.rest_cov, lookup.log_factor))
+    assert (lookup.rest_cov[:, [0, 2]] > 0.0).all()
