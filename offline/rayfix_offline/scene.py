@@ -6,6 +6,7 @@ import io
 import logging
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ class Scene:
     objects: tuple[str, ...]
     num_degenerate: int = 0
 
-    @property
+    @cached_property
     def triangles(self) -> NDArray[np.float64]:
         """Corners of the triangles, shape (n_faces, 3, 3), m."""
         return self.vertices[self.faces]

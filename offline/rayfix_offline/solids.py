@@ -9,12 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from trimesh.triangles import closest_point
 
 from rayfix_offline.scene import Scene
 from rayfix_tables.freespace import FreeSpace
 
 MAX_VOXELS = 20_000_000
 """The free space of a large building is cut more coarsely rather than into more voxels than this."""
+
+TOUCH = 1e-3
+"""Whatever is nearer to a surface lies on it, m."""
 
 _WELD = 1e-6
 _ENCLOSURE_SHARE = 0.05
@@ -105,6 +109,24 @@ def is_inside(triangles: NDArray[np.float64], point: NDArray[np.float64]) -> boo
     return votes >= 2
 
 
+def touched(triangles: NDArray[np.float64], point: NDArray[np.float64]) -> int:
+    """Triangle that a point lies on, on neither side of it.
+
+    Parameters
+    ----------
+    triangles : ndarray of shape (n, 3, 3), m
+    point : ndarray of shape (3,), m
+
+    Returns
+    -------
+    int
+        Index of the triangle, -1 for none.
+    """
+    distance = np.linalg.norm(closest_point(triangles, np.broadcast_to(point, (len(triangles), 3))) - point, axis=1)
+    nearest = int(distance.argmin())
+    return nearest if distance[nearest] < TOUCH else -1
+
+
 def find_enclosures(
     scene: Scene, parts: Sequence[Part], stations: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -121,6 +143,7 @@ def find_enclosures(
     -------
     enclosing : ndarray of bool, shape (n_parts,)
     inside : ndarray of bool, shape (n_parts, n_stations)
+        Or on the part's surface.
     """
     scene_volume = float(np.prod(np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)))
     inside = np.zeros((len(parts), len(stations)), bool)
@@ -130,8 +153,8 @@ def find_enclosures(
             continue
         triangles = scene.triangles[part.faces]
         low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-        for s in np.flatnonzero(np.all((stations >= low) & (stations <= high), axis=1)):
-            inside[i, s] = is_inside(triangles, stations[s])
+        for s in np.flatnonzero(np.all((stations >= low - TOUCH) & (stations <= high + TOUCH), axis=1)):
+            inside[i, s] = is_inside(triangles, stations[s]) or touched(triangles, stations[s]) >= 0
         enclosing[i] = inside[i].mean() > 0.5 and abs(part.volume) > _ENCLOSURE_SHARE * scene_volume
     return enclosing, inside
 
@@ -153,9 +176,18 @@ def map_free_space(
     free = np.ones(shape, bool)
     for part, encloses in zip(parts, enclosing, strict=True):
         if part.closed:
-            parity = np.zeros(shape, bool)
-            _flip_above(scene.triangles[part.faces], low, voxel_size, parity)
-            free &= parity if encloses else ~parity
+            triangles = scene.triangles[part.faces]
+            reach = (np.stack([triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))]) - low) / voxel_size
+            first, stop = np.floor(reach[0]).astype(np.int64), np.ceil(reach[1]).astype(np.int64) + 1
+            block = tuple(slice(a, b) for a, b in zip(first, stop, strict=True))
+            parity = np.zeros(free[block].shape, bool)
+            _flip_above(triangles, low + first * voxel_size, voxel_size, parity)
+            if encloses:
+                inside = np.zeros(shape, bool)
+                inside[block] = parity
+                free &= inside
+            else:
+                free[block] &= ~parity
     return FreeSpace(origin=low, voxel_size=voxel_size, free=free)
 
 

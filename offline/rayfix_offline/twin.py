@@ -11,7 +11,7 @@ from rayfix_offline.engine import EmbreeEngine, RayEngine
 from rayfix_offline.planes import Planes, merge_coplanar
 from rayfix_offline.scene import Scene, load_scene
 from rayfix_offline.site import SiteFile
-from rayfix_offline.solids import Part, find_enclosures, map_free_space, split_parts
+from rayfix_offline.solids import Part, find_enclosures, map_free_space, split_parts, touched
 from rayfix_tables.errors import SceneError
 from rayfix_tables.freespace import FreeSpace
 
@@ -148,6 +148,11 @@ def _station_findings(
         if np.any(position < low) or np.any(position > high):
             box = " to ".join(f"({', '.join(f'{v:g}' for v in corner)})" for corner in (low, high))
             messages.append(f"{place} lies outside the scene, which spans {box} m; correct position_m or scene_unit")
+            continue
+        face = touched(scene.triangles, position)
+        if face >= 0:
+            name = scene.objects[scene.face_objects[face]]
+            messages.append(f"{place} lies on the surface of '{name}'; move it a few centimetres off")
             continue
         for p, part in enumerate(parts):
             if part.closed and inside[p, s] != enclosing[p]:

@@ -42,4 +42,4 @@ class FreeSpace:
         index = np.floor((points - self.origin) / self.voxel_size).astype(np.int64)
         inside = np.all((index >= 0) & (index < self.free.shape), axis=-1)
         index = np.where(inside[..., None], index, 0)
-        return inside & self.free[index[..., 0], index[..., 1], index[..., 2]]
+        return np.asarray(inside & self.free[index[..., 0], index[..., 1], index[..., 2]])

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+import anyio
 import httpx
 import numpy as np
 import pytest
@@ -114,8 +115,10 @@ async def test_the_warehouse_is_served(warehouse_table: Table) -> None:
     async with app.router.lifespan_context(app):
         transport = httpx.ASGITransport(app=app)
         async with httpx.AsyncClient(transport=transport, base_url="http://rayfix") as client:
-            while (await client.get("/readyz")).status_code != httpx.codes.OK:
-                pass
+            for _ in range(600):
+                if (await client.get("/readyz")).status_code == httpx.codes.OK:
+                    break
+                await anyio.sleep(0.1)
             answer = await client.post("/v1/positions", json=report)
     assert answer.status_code == httpx.codes.OK
     position = [answer.json()["position"][axis] for axis in "xyz"]

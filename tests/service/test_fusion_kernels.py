@@ -54,7 +54,7 @@ def random_mixture(rng: np.random.Generator, count: int, window: float = 0.05) -
 
 def random_gaussians(rng: np.random.Generator, count: int) -> tuple[Array, Array, Array]:
     """Log evidences, means and covariances over (x, path length)."""
-    return rng.normal(size=count), rng.normal(0.0, 5.0, (count, 4)), random_cov(rng, count, [0.5, 0.7, 0.2, 0.6])
+    return rng.normal(size=count), rng.normal(0.0, 1.5, (count, 4)), random_cov(rng, count, [0.5, 0.7, 0.2, 0.6])
 
 
 def random_factor(rng: np.random.Generator, count: int, times: Times, dimension: int) -> tuple[Array, Array, Array]:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -16,6 +16,7 @@ azimuths = st.floats(-np.pi, np.pi, exclude_min=True)
 zeniths = st.floats(0.0, np.pi)
 
 
+@settings(deadline=None)
 @given(angles)
 def test_wrap_stays_in_its_interval_and_turns_by_whole_turns(angle: float) -> None:
     wrapped = float(wrap(angle))
@@ -24,6 +25,7 @@ def test_wrap_stays_in_its_interval_and_turns_by_whole_turns(angle: float) -> No
     assert abs(math.remainder(angle - wrapped, 2.0 * np.pi)) <= 4.0 * np.spacing(max(abs(angle), np.pi))
 
 
+@settings(deadline=None)
 @given(azimuths)
 def test_wrap_leaves_what_is_wrapped(azimuth: float) -> None:
     assert float(wrap(azimuth)) == azimuth
@@ -47,6 +49,7 @@ def test_wrap_at_the_seam(angle: float, wrapped: float) -> None:
     assert float(wrap(angle)) == wrapped
 
 
+@settings(deadline=None)
 @given(azimuths, st.floats(-0.9, 0.9), st.integers(-3, 3))
 def test_a_difference_across_the_seam_is_the_small_one(azimuth: float, step: float, turns: int) -> None:
     difference = float(wrap(azimuth + step + turns * 2.0 * np.pi - azimuth))
@@ -81,6 +84,7 @@ def test_direction_broadcasts() -> None:
     assert direction(np.zeros((4, 1)), np.zeros(5)).shape == (4, 5, 3)
 
 
+@settings(deadline=None)
 @given(azimuths, st.floats(1e-3, np.pi - 1e-3), st.floats(1e-3, 1e3))
 def test_angles_of_inverts_direction(azimuth: float, zenith: float, length: float) -> None:
     back_azimuth, back_zenith = angles_of(length * direction(azimuth, zenith))
@@ -96,6 +100,7 @@ def test_angles_of_vectors_on_the_seam_have_azimuth_pi() -> None:
     np.testing.assert_array_equal(zenith, [np.pi / 2, np.pi / 2])
 
 
+@settings(deadline=None)
 @given(azimuths, zeniths, azimuths, zeniths)
 def test_tangent_is_odd_in_the_deviation(azimuth: float, zenith: float, centre: float, centre_zenith: float) -> None:
     horizontal, vertical = tangent(azimuth, zenith, centre, centre_zenith)
@@ -107,6 +112,7 @@ def test_tangent_is_odd_in_the_deviation(azimuth: float, zenith: float, centre: 
         assert abs(float(back)) < 1e-11
 
 
+@settings(deadline=None)
 @given(azimuths, st.floats(0.2, np.pi - 0.2), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
 def test_tangent_coordinates_are_arcs_near_the_centre(
     azimuth: float, zenith: float, horizontal: float, vertical: float
@@ -158,6 +164,7 @@ def test_rotation_of_the_standard() -> None:
     np.testing.assert_allclose(local_to_scene((a, b, c)), expected, rtol=0, atol=ROUNDING)
 
 
+@settings(deadline=None)
 @given(st.tuples(azimuths, azimuths, azimuths))
 def test_local_to_scene_is_a_rotation(orientation: tuple[float, float, float]) -> None:
     matrix = local_to_scene(orientation)

@@ -1,7 +1,7 @@
 """The voxel map of the free space."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rayfix_tables.freespace import FreeSpace
@@ -31,6 +31,7 @@ def test_an_l_shaped_room() -> None:
     assert not space.contains(np.array([2.0, 2.0, 0.0]))
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_voxel_centres_say_what_their_voxel_says(seed: int) -> None:
     rng = np.random.default_rng(seed)

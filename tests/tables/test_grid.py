@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rayfix_tables.angles import angles_of, wrap
@@ -11,6 +11,7 @@ from rayfix_tables.grid import AngularGrid
 spacings = st.floats(0.02, 1.5)  # rad
 
 
+@settings(deadline=None)
 @given(spacings)
 def test_cells_are_about_as_wide_as_asked(spacing: float) -> None:
     grid = AngularGrid.from_spacing(spacing)
@@ -24,6 +25,7 @@ def test_cells_are_about_as_wide_as_asked(spacing: float) -> None:
     assert np.all((grid.ring_cells == 1) | (wider > spacing * (1.0 - 1e-15)))
 
 
+@settings(deadline=None)
 @given(spacings)
 def test_solid_angles_add_up_to_the_sphere(spacing: float) -> None:
     grid = AngularGrid.from_spacing(spacing)
@@ -31,6 +33,7 @@ def test_solid_angles_add_up_to_the_sphere(spacing: float) -> None:
     assert np.sum(grid.solid_angles * grid.ring_cells) == pytest.approx(4.0 * np.pi, rel=1e-13)
 
 
+@settings(deadline=None)
 @given(spacings)
 def test_centres_lie_in_their_own_cells(spacing: float) -> None:
     grid = AngularGrid.from_spacing(spacing)
@@ -39,6 +42,7 @@ def test_centres_lie_in_their_own_cells(spacing: float) -> None:
     np.testing.assert_array_equal(grid.nearest(azimuth, zenith), np.arange(grid.num_cells))
 
 
+@settings(deadline=None)
 @given(spacings, st.integers(0, 2**32 - 1))
 def test_the_nearest_cell_holds_the_direction(spacing: float, seed: int) -> None:
     """Within half a cell of the centre in azimuth and zenith, whatever turns the azimuth is given with."""

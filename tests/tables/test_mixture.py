@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES, TubeMixture, pack, unpack
@@ -25,6 +25,7 @@ def test_packing_by_hand() -> None:
     np.testing.assert_array_equal(unpack(np.arange(1, 7)), matrix)
 
 
+@settings(deadline=None)
 @given(seeds, shapes)
 def test_packing_is_undone(seed: int, shape: tuple[int, ...]) -> None:
     packed = np.random.default_rng(seed).normal(size=(*shape, 6))
@@ -40,6 +41,7 @@ def test_packing_keeps_the_type(dtype: type[np.generic]) -> None:
     assert unpack(np.zeros((2, 6), dtype)).dtype == dtype
 
 
+@settings(deadline=None)
 @given(seeds, st.integers(0, 5), st.integers(0, 5))
 def test_concatenated_parts_come_back_as_slices(seed: int, first: int, second: int) -> None:
     parts = [random_mixture(seed, first), random_mixture(seed + 1, second)]
@@ -63,6 +65,7 @@ def test_nothing_is_an_empty_mixture() -> None:
             assert getattr(mixture, name).dtype == FIELD_DTYPES[name]
 
 
+@settings(deadline=None)
 @given(seeds, st.integers(0, 5))
 def test_stored_types(seed: int, count: int) -> None:
     """28 single-precision numbers and one small integer a component."""

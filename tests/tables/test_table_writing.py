@@ -118,10 +118,10 @@ def test_what_can_be_known_before_the_work(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(TableError, match=r"it is a folder; give a file name such as .*table\.h5"):
         check_writable(tmp_path)
-    with pytest.raises(TableError, match="there is no folder .*none; create it first"):
+    with pytest.raises(TableError, match=r"there is no folder .*none; create it first"):
         check_writable(tmp_path / "none" / "t.h5")
     (tmp_path / "file").touch()
-    with pytest.raises(TableError, match="there is no folder .*file; create it first"):
+    with pytest.raises(TableError, match=r"there is no folder .*file; create it first"):
         check_writable(tmp_path / "file" / "t.h5")
 
 

@@ -60,7 +60,7 @@ def multiply(
     score = np.zeros(1)
     # Few alternatives first: they cut the beam before it meets the many. Which of two alike comes first must not
     # depend on the report's order.
-    for i in sorted(range(len(factors)), key=lambda i: (len(factors[i]), factors[i].log_scale.max())):
+    for i in sorted(range(len(factors)), key=lambda i: (len(factors[i]), factors[i].log_scale.sum())):
         factor = factors[i]
         parent, choice, score = extend_beam(
             information,

@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.kernels import condition_on_angle, condition_on_length, to_information
 from rayfix_service.fusion.lookup import Lookup, look_up
-from rayfix_service.fusion.observations import Observation
+from rayfix_service.fusion.observations import ClockReading, Observation
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.table import StationPart
 
@@ -70,29 +71,50 @@ def make_factor(
     log_clocks = -len({reading.clock for reading in readings}) * math.log(max_path_length)
     parts = []
     if observation.angle_index is not None and variances:
-        parts.append((TIME_OUTLIER, log_evidence + (log_good + log_bad + log_any_time), mean, cov, 0.0))
+        parts.append(_Part(TIME_OUTLIER, log_evidence + (log_good + log_bad + log_any_time), mean, cov, 0.0))
         log_evidence, mean, cov = log_evidence + 2.0 * log_good, mean.copy(), cov.copy()
     else:
         log_evidence += log_good
     for length, variance in observation.lengths:
         condition_on_length(log_evidence, mean, cov, length, variance)
-    parts.insert(0, (ALL_GOOD, log_evidence, mean, cov, log_clocks))
-    top = max(log_outlier + log_volume, *(float(log.max()) + cost for _, log, _, _, cost in parts))
+    parts.insert(0, _Part(ALL_GOOD, log_evidence, mean, cov, log_clocks))
+    top = max(log_outlier + log_volume, *(float(part.log_evidence.max()) + part.log_clocks for part in parts))
     floor = top + math.log(settings.component_floor)
-    keeps = [np.flatnonzero(log > floor - cost) for _, log, _, _, cost in parts]
-    total, dimension = sum(len(keep) for keep in keeps) + 1, 3 + num_clocks
+    keeps = [np.flatnonzero(part.log_evidence + part.log_clocks > floor) for part in parts]
+    return _alternatives(parts, keeps, readings, log_outlier, 3 + num_clocks)
+
+
+class _Part(NamedTuple):
+    """Alternatives of one kind, before the readings of clocks, and the logarithm of what those will cost at least."""
+
+    kind: int
+    log_evidence: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    cov: NDArray[np.float64]
+    log_clocks: float
+
+
+def _alternatives(
+    parts: list[_Part],
+    keeps: list[NDArray[np.int64]],
+    readings: tuple[ClockReading, ...],
+    log_outlier: float,
+    dimension: int,
+) -> Factor:
+    """Factor of those alternatives of each part that are kept, and the outlier."""
+    total = sum(len(keep) for keep in keeps) + 1
     information = np.zeros((total, dimension, dimension))
     eta, log_scale = np.zeros((total, dimension)), np.full(total, log_outlier)
     outlier = np.full(total, ALL_OUTLIER, np.int8)
     begin = 0
-    for keep, (kind, log, m, c, _) in zip(keeps, parts, strict=True):
-        taken = readings if kind == ALL_GOOD else ()
+    for part, keep in zip(parts, keeps, strict=True):
+        taken = readings if part.kind == ALL_GOOD else ()
         out = slice(begin, begin + len(keep))
         to_information(
             keep,
-            log,
-            m,
-            c,
+            part.log_evidence,
+            part.mean,
+            part.cov,
             np.array([r.clock for r in taken], np.int64),
             np.array([r.offset for r in taken], np.float64),
             np.array([r.variance for r in taken], np.float64),
@@ -100,7 +122,7 @@ def make_factor(
             eta[out],
             log_scale[out],
         )
-        outlier[out] = kind
+        outlier[out] = part.kind
         begin = out.stop
     return Factor(information=information, eta=eta, log_scale=log_scale, outlier=outlier)
 

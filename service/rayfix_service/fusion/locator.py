@@ -71,7 +71,7 @@ class Locator:
             if p > _LEAST_CANDIDATE or n == 0
         )
         half_bad = (hypotheses.outlier == ALL_OUTLIER).mean(axis=1) >= 0.5
-        status = self._status(candidates[0], lost + float(weight[half_bad].sum()))
+        status = self._status(candidates, lost + float(weight[half_bad].sum()))
         outlier = _outlier_probabilities(observations, hypotheses.outlier, weight, lost)
         return self._fix(report, status, candidates, outlier, unused, log_evidence)
 
@@ -102,13 +102,14 @@ class Locator:
                     unused[index] = _NO_RAYS.format(observation.station_id)
         return observations, factors
 
-    def _status(self, best: Candidate, half_bad: float) -> Status:
+    def _status(self, candidates: tuple[Candidate, ...], half_bad: float) -> Status:
         """Status of a fix, given the probability that at least half of the factors are outliers."""
         if half_bad > 0.5:
             return "inconsistent"
-        if best.probability < self.settings.ambiguous_below:
-            return "ambiguous"
-        largest = float(np.sqrt(np.linalg.eigvalsh(best.covariance)[-1]))
+        if candidates[0].probability < self.settings.ambiguous_below:
+            rivals = sum(candidate.probability for candidate in candidates[: self.settings.most_rivals])
+            return "ambiguous" if rivals >= self.settings.ambiguous_below else "insufficient"
+        largest = float(np.sqrt(np.linalg.eigvalsh(candidates[0].covariance)[-1]))
         return "insufficient" if largest > self.settings.insufficient_above else "ok"
 
     def _fix(

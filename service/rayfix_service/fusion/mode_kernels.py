@@ -25,40 +25,47 @@ def cut_gaussians(mean: Any, cov: Any, points: Any, origin: Any, voxel_size: Any
         keeps its covariance.
     """
     lower = np.zeros((3, 3))
-    apart = np.empty(3)
     first = np.empty(3)
     second = np.empty((3, 3))
+    nx, ny, nz = free.shape
     for h in range(len(mean)):
         cholesky(cov[h], lower)
+        # In voxels.
+        x0, y0, z0 = (mean[h] - origin) / voxel_size
+        xx, yx, yy = lower[0, 0] / voxel_size, lower[1, 0] / voxel_size, lower[1, 1] / voxel_size
+        zx, zy, zz = lower[2, 0] / voxel_size, lower[2, 1] / voxel_size, lower[2, 2] / voxel_size
         count = 0
         first[:] = 0.0
         second[:] = 0.0
         for n in range(len(points)):
-            for i in range(3):
-                apart[i] = 0.0
-                for j in range(i + 1):
-                    apart[i] += lower[i, j] * points[n, j]
-            x = np.floor((mean[h, 0] + apart[0] - origin[0]) / voxel_size)
-            y = np.floor((mean[h, 1] + apart[1] - origin[1]) / voxel_size)
-            z = np.floor((mean[h, 2] + apart[2] - origin[2]) / voxel_size)
-            inside = 0 <= x < free.shape[0] and 0 <= y < free.shape[1] and 0 <= z < free.shape[2]
-            if not inside or not free[int(x), int(y), int(z)]:
+            p, q, r = points[n, 0], points[n, 1], points[n, 2]
+            x = np.floor(x0 + xx * p)
+            y = np.floor(y0 + yx * p + yy * q)
+            z = np.floor(z0 + zx * p + zy * q + zz * r)
+            if not (0 <= x < nx and 0 <= y < ny and 0 <= z < nz) or not free[int(x), int(y), int(z)]:
                 continue
             count += 1
             for i in range(3):
-                first[i] += apart[i]
-                for j in range(3):
-                    second[i, j] += apart[i] * apart[j]
+                first[i] += points[n, i]
+                for j in range(i + 1):
+                    second[i, j] += points[n, i] * points[n, j]
         out_share[h] = count / len(points)
         if count == 0 or count == len(points):
             continue
+        first /= count
         for i in range(3):
-            mean[h, i] += first[i] / count
+            for j in range(i + 1):
+                second[i, j] = second[i, j] / count - first[i] * first[j]
+                second[j, i] = second[i, j]
+            mean[h, i] += lower[i, 0] * first[0] + lower[i, 1] * first[1] + lower[i, 2] * first[2]
         if count > 8:
+            # A little of the uncut covariance keeps the cut one regular.
             for i in range(3):
                 for j in range(3):
-                    inner = second[i, j] / count - first[i] * first[j] / (count * count)
-                    # A little of the uncut covariance keeps the cut one regular.
+                    inner = 0.0
+                    for k in range(i + 1):
+                        for m in range(j + 1):
+                            inner += lower[i, k] * second[k, m] * lower[j, m]
                     cov[h, i, j] = 0.9 * inner + 0.1 * cov[h, i, j]
 
 

@@ -91,8 +91,9 @@ def find_modes(
     precision = inv(cov)
     top, member = gather(log_weight + 0.5 * slogdet(precision)[1], mean, precision, _SAME_HILL)
     belongs = np.exp(log_weight) * (member == np.arange(len(top))[:, None])
-    probability = belongs.sum(axis=1)
-    share = belongs / probability[:, None]
+    total = belongs.sum(axis=1)
+    share = belongs / total[:, None]
+    probability = np.minimum(total, 1.0)  # a sum of rounded numbers may be a little more
     position = share @ mean
     in_solid = ~free_space.contains(position)
     position[in_solid] = top[in_solid]

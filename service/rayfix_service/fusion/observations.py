@@ -120,9 +120,20 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
                     _Arrival(index=index, station_id=station.id, offset=offset, variance=measurement.stdev**2)
                 )
     clocks = [arrivals, *(_on_one_clock(reference, rows) for reference, rows in differences.items())]
+    num_clocks = _read_clocks(clocks, site.max_path_length, drafts, unused)
+    observations = [
+        observation for station_id, draft in drafts.items() for observation in _observations(station_id, draft)
+    ]
+    return SortedReport(observations=tuple(observations), num_clocks=num_clocks, unused=unused)
+
+
+def _read_clocks(
+    clocks: list[list[_Arrival]], max_path_length: float, drafts: defaultdict[str, _Draft], unused: dict[int, str]
+) -> int:
+    """Give stations their readings of clocks; returns the number of clocks that more than one station reads."""
     num_clocks = 0
     for clock in clocks:
-        near = _near_each_other(clock, site.max_path_length)
+        near = _near_each_other(clock, max_path_length)
         if len({row.station_id for row in near}) > 1:
             near_indices = [row.index for row in near if row.index is not None]
             for row in near:
@@ -136,10 +147,7 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
         else:
             alone = len({row.station_id for row in clock}) == 1
             unused.update({row.index: _ALONE if alone else _FAR for row in clock if row.index is not None})
-    observations = [
-        observation for station_id, draft in drafts.items() for observation in _observations(station_id, draft)
-    ]
-    return SortedReport(observations=tuple(observations), num_clocks=num_clocks, unused=unused)
+    return num_clocks
 
 
 def _on_one_clock(reference: str, differences: list[_Arrival]) -> list[_Arrival]:

@@ -20,6 +20,8 @@ class FusionSettings:
         Hypotheses whose share of the posterior is below this are left out of the answer.
     ambiguous_below : float
         A best candidate less probable than this makes the fix ``ambiguous``.
+    most_rivals : int
+        An ambiguous fix of which not even this many candidates together are that probable is ``insufficient``.
     insufficient_above : float, m
         A best candidate whose largest standard deviation is above this makes the fix ``insufficient``.
     confidence : float
@@ -31,5 +33,6 @@ class FusionSettings:
     component_floor: float = 1e-6
     hypothesis_floor: float = 1e-5
     ambiguous_below: float = 0.7
+    most_rivals: int = 3
     insufficient_above: float = 3.0
     confidence: float = 0.68
