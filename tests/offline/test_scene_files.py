@@ -170,9 +170,7 @@ def test_transforms_of_nested_nodes(tmp_path: Path) -> None:
     scene.graph.update("copy", "world", matrix=np.diag((2.0, 2.0, 2.0, 1.0)), geometry="bolt")
     (tmp_path / "a.glb").write_bytes(scene.export(file_type="glb"))
     loaded = load_scene(tmp_path / "a.glb")
-    boxes = {
-        name: loaded.triangles[loaded.face_objects == i].reshape(-1, 3) for i, name in enumerate(loaded.objects)
-    }
+    boxes = {name: loaded.triangles[loaded.face_objects == i].reshape(-1, 3) for i, name in enumerate(loaded.objects)}
     np.testing.assert_allclose(boxes["bolt"].mean(axis=0), (10, 1, 0), rtol=0, atol=SINGLE)
     np.testing.assert_allclose(np.ptp(boxes["bolt"], axis=0), (0.4, 0.2, 0.6), rtol=0, atol=SINGLE)
     np.testing.assert_allclose(boxes["copy"].mean(axis=0), (0, 0, 0), rtol=0, atol=SINGLE)
@@ -230,7 +228,9 @@ def test_an_unknown_type(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", FILE_TYPES)
-@pytest.mark.parametrize("content", [b"", b"\n", b"hello", b"\x00" * 200, bytes(range(256)) * 4, b"glTF\x02\x00\x00\x00"])
+@pytest.mark.parametrize(
+    "content", [b"", b"\n", b"hello", b"\x00" * 200, bytes(range(256)) * 4, b"glTF\x02\x00\x00\x00"]
+)
 def test_garbage(tmp_path: Path, kind: str, content: bytes, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / f"a.{kind}"
     path.write_bytes(content)

@@ -177,7 +177,9 @@ class Posterior:
     outlier: Array
 
 
-def angle_of(tube: Tube, shift: tuple[float, float] = (0.01, -0.015), stdev: tuple[float, float] = (0.02, 0.03)) -> Angle:
+def angle_of(
+    tube: Tube, shift: tuple[float, float] = (0.01, -0.015), stdev: tuple[float, float] = (0.02, 0.03)
+) -> Angle:
     """Angle towards a tube's middle, off by this many rad."""
     azimuth, zenith = angles_of(tube.x_mean - np.array(POSITIONS[tube.station_id]))
     return Angle(
@@ -202,7 +204,9 @@ def oracle(tubes: list[Tube], measurements: list[Measurement]) -> Posterior:
     size = 3 + 3 * num + (1 if arrivals else 0)
     patterns = []
     for kinds in itertools.product(("good", "late", "bad"), repeat=num):
-        timed = [[m for m in measurements if not isinstance(m, Angle) and places[m.station_id] == n] for n in range(num)]
+        timed = [
+            [m for m in measurements if not isinstance(m, Angle) and places[m.station_id] == n] for n in range(num)
+        ]
         if any(kind == "late" and not (timed[n] and n in angles) for n, kind in enumerate(kinds)):
             continue
         product, log_prior, clock_known = Product(size), 0.0, False
