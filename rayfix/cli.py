@@ -61,6 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     build.add_argument("site", type=Path, metavar="SITE.toml")
     build.add_argument("-o", "--output", type=Path, required=True, metavar="T.h5")
     build.add_argument("--jobs", type=_jobs, default=-1, help="cells fitted at a time (default: one per core)")
+    build.add_argument("--cluster", metavar="ADDRESS", help="let the workers of this Dask scheduler fit the cells")
     build.add_argument("--no-progress", action="store_true", help="show no progress bar")
     build.add_argument("--json", action="store_true", help="print the summary as JSON")
 
@@ -131,7 +132,9 @@ def _build(options: argparse.Namespace) -> int:
     from rayfix.console import build_progress, print_build_summary
 
     with build_progress(enabled=not options.no_progress) as progress:
-        summary = build_table(options.site, options.output, jobs=options.jobs, progress=progress)
+        summary = build_table(
+            options.site, options.output, jobs=options.jobs, cluster=options.cluster, progress=progress
+        )
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     if options.json:

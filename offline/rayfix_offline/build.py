@@ -7,8 +7,10 @@ where it was; a station whose part of the table at the same place is still right
 import resource
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -23,6 +25,9 @@ from rayfix_tables.errors import BuildError, TableError
 from rayfix_tables.table import StationPart, Table
 from rayfix_tables.version import software_version
 from rayfix_tables.write import LevelContent, SceneContent, StationContent, check_writable, write_table
+
+if TYPE_CHECKING:
+    from rayfix_offline.cluster import Cluster
 
 LOST_RAYS_WARNING = 0.01
 """In a closed scene, more lost rays than this share mean that it has holes."""
@@ -71,7 +76,12 @@ class BuildSummary:
 
 
 def build_table(
-    site_path: str | Path, table_path: str | Path, *, jobs: int = -1, progress: Progress | None = None
+    site_path: str | Path,
+    table_path: str | Path,
+    *,
+    jobs: int = -1,
+    cluster: str | None = None,
+    progress: Progress | None = None,
 ) -> BuildSummary:
     """Build a site's table, or what of it is missing or has changed.
 
@@ -81,6 +91,8 @@ def build_table(
         Where the table goes. A former table there is replaced when the new one is whole.
     jobs : int
         Cells that are fitted at a time; -1 for one per core.
+    cluster : str, optional
+        Address of a Dask scheduler, whose workers then fit the cells.
     progress : callable, optional
         Called as the build goes on.
 
@@ -89,7 +101,7 @@ def build_table(
     SiteError, SceneError
         When the site or its scene cannot be used.
     BuildError
-        When no ray finds anything, or the disk is full; finished blocks stay for the next run.
+        When no ray finds anything, the cluster fails, or the disk is full; finished blocks stay for the next run.
     TableError
         When the table cannot be written. No partial table is left, and a former one stays as it was.
     """
@@ -108,16 +120,19 @@ def build_table(
     done = 0
     contents: list[StationContent] = []
     origins: list[str] = []
-    for plan in plans:
-        if plan.part_id in former:
-            contents.append(_kept_content(former[plan.part_id]))
-            origins.append("kept")
+    with ExitStack() as stack:
+        remote: Cluster | None = None
+        for plan in plans:
+            if plan.part_id in former:
+                contents.append(_kept_content(former[plan.part_id]))
+                origins.append("kept")
+            else:
+                if cluster is not None and remote is None:
+                    remote = stack.enter_context(_connect(cluster, site, twin))
+                content, resumed = _build_station(plan, site, twin, store, jobs, remote, _Shifted(report, done, total))
+                contents.append(content)
+                origins.append("resumed" if resumed else "built")
             done += plan.num_cells
-            continue
-        content, resumed = _build_station(plan, site, twin, store, jobs, _Shifted(report, done, total))
-        contents.append(content)
-        origins.append("resumed" if resumed else "built")
-        done += plan.num_cells
     if not any(len(level.mixture) for content in contents for level in content.levels):
         raise BuildError("no ray of any station finds free space; check the stations' positions and fields of view")
     report("writing", done, total)
@@ -156,7 +171,13 @@ class _Shifted:
 
 
 def _build_station(
-    plan: StationPlan, site: SiteFile, twin: Twin, store: ShardStore, jobs: int, report: _Shifted
+    plan: StationPlan,
+    site: SiteFile,
+    twin: Twin,
+    store: ShardStore,
+    jobs: int,
+    remote: "Cluster | None",
+    report: _Shifted,
 ) -> tuple[StationContent, bool]:
     """Build a station's part, and tell whether some of it came from shards."""
     station_id = plan.station.id
@@ -172,10 +193,13 @@ def _build_station(
     done = plan.num_cells - sum(len(block.cells) for block in missing)
     if missing or launch is None:
         report(f"{station_id}: tracing rays", done)
-        trace = trace_station(plan.section, site, twin)
-        launch = {"lost_ray_share": np.array(trace.lost_ray_share), "coverage": np.array(trace.coverage)}
+        if remote is None:
+            trace = trace_station(plan.section, site, twin)
+            launch, fitting = trace.to_arrays(), _fit_blocks(missing, trace, site, jobs)
+        else:
+            launch, fitting = remote.launch(plan), remote.fit_blocks(plan, missing)
         store.save(f"{plan.part_id}-launch", launch)
-        for block, fitted in _fit_blocks(missing, trace, site, jobs):
+        for block, fitted in fitting:
             store.save(f"{plan.part_id}-{block.shard}", fitted.to_arrays())
             parts[block.level, block.number] = fitted
             done += len(block.cells)
@@ -191,6 +215,17 @@ def _build_station(
         coverage=tuple(float(share) for share in launch["coverage"]),
     )
     return content, resumed
+
+
+def _connect(address: str, site: SiteFile, twin: Twin) -> "Cluster":
+    """Connect to a cluster; only this needs Dask."""
+    try:
+        from rayfix_offline.cluster import Cluster
+    except ModuleNotFoundError as error:
+        raise BuildError(
+            f"the module '{error.name}' is not installed; install it with: pip install 'rayfix[cluster]'"
+        ) from error
+    return Cluster(address, site, twin.scene)
 
 
 def _fit_blocks(
