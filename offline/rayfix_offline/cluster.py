@@ -8,7 +8,6 @@ is lost, Dask gives its blocks to the others.
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import CancelledError
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from rayfix_offline.cells import FittedCells, fit_cells
 from rayfix_offline.plan import BUILD_VERSION, Block, StationPlan
 from rayfix_offline.scene import Scene
+from rayfix_offline.shards import content_key
 from rayfix_offline.site import SiteFile, parse_site
 from rayfix_offline.trace import StationTrace, trace_station
 from rayfix_offline.twin import prepare_scene
@@ -31,10 +31,6 @@ RETRIES = 5
 
 TRACES_KEPT = 2
 """Stations whose rays a worker keeps in memory; blocks come station by station."""
-
-_FAILED = (
-    "station '{}' could not be built on the cluster: {}; finished blocks are kept, run the same build again to go on"
-)
 
 _Task = tuple[Callable[..., dict[str, Any]], tuple[Any, ...]]
 
@@ -67,6 +63,7 @@ class Cluster:
             self._client.close()
             raise BuildError(f"the Dask scheduler at {address} has no workers; start some with 'dask worker {address}'")
         self._site, self._scene = site.model_dump(mode="json"), scene
+        self._inputs_id = content_key(self._site, scene.sha256)
 
     def __enter__(self) -> "Cluster":
         """Return the connection."""
@@ -101,50 +98,50 @@ class Cluster:
             yield by_name[name], FittedCells.from_arrays(arrays)
 
     def _run(self, plan: StationPlan, tasks: Mapping[str, _Task]) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Run tasks on the workers; those that are lost together with their inputs are sent out again."""
-        left = dict(tasks)
-        for _ in range(1 + RETRIES):
-            site, scene = self._client.scatter([self._site, self._scene], hash=True, broadcast=True)
-            futures = {
-                self._client.submit(
-                    run,
-                    (plan.part_id, BUILD_VERSION, plan.station.id),
-                    site,
-                    scene,
-                    *arguments,
-                    key=f"rayfix-{plan.part_id}-{name}",
-                    retries=RETRIES,
-                ): name
-                for name, (run, arguments) in left.items()
-            }
-            for future in as_completed(list(futures), loop=self._client.loop):
-                try:
-                    arrays = future.result()
-                except CancelledError:
-                    continue  # the worker took the scene with it
-                except BuildError:
-                    raise
-                except Exception as error:  # whatever a worker of the cluster meets
-                    raise BuildError(_FAILED.format(plan.station.id, error)) from error
-                left.pop(futures[future])
-                yield futures[future], arrays
-                future.release()
-            if not left:
-                return
-        raise BuildError(_FAILED.format(plan.station.id, "its workers keep getting lost"))
+        """Run tasks on the workers."""
+        # A task that hands the inputs on, and not data scattered to workers: Dask can repeat it when they are lost.
+        inputs = self._client.submit(_inputs, self._site, self._scene, key=f"rayfix-inputs-{self._inputs_id}")
+        futures = {
+            self._client.submit(
+                run,
+                (plan.part_id, BUILD_VERSION, plan.station.id),
+                inputs,
+                *arguments,
+                key=f"rayfix-{plan.part_id}-{name}",
+                retries=RETRIES,
+            ): name
+            for name, (run, arguments) in tasks.items()
+        }
+        for future in as_completed(list(futures), loop=self._client.loop):
+            try:
+                arrays = future.result()
+            except BuildError:
+                raise
+            except Exception as error:  # whatever a worker of the cluster meets
+                raise BuildError(
+                    f"station '{plan.station.id}' could not be built on the cluster: {error}; finished blocks are "
+                    "kept, run the same build again to go on"
+                ) from error
+            yield futures[future], arrays
+            future.release()
+
+
+def _inputs(site: dict[str, Any], scene: Scene) -> tuple[dict[str, Any], Scene]:
+    """Hand the inputs of all tasks on to the workers."""
+    return site, scene
 
 
 def _fit_remotely(
-    part: tuple[str, int, str], site: dict[str, Any], scene: Scene, level: int, cells: NDArray[np.int64]
+    part: tuple[str, int, str], inputs: tuple[dict[str, Any], Scene], level: int, cells: NDArray[np.int64]
 ) -> dict[str, Any]:
     """Fit a block on a worker."""
-    parsed = parse_site(site)
-    return fit_cells(cells, _trace(part, parsed, scene).levels[level], parsed).to_arrays()
+    site = parse_site(inputs[0])
+    return fit_cells(cells, _trace(part, site, inputs[1]).levels[level], site).to_arrays()
 
 
-def _launch_remotely(part: tuple[str, int, str], site: dict[str, Any], scene: Scene) -> dict[str, Any]:
+def _launch_remotely(part: tuple[str, int, str], inputs: tuple[dict[str, Any], Scene]) -> dict[str, Any]:
     """Trace a station's rays on a worker."""
-    return _trace(part, parse_site(site), scene).to_arrays()
+    return _trace(part, parse_site(inputs[0]), inputs[1]).to_arrays()
 
 
 def _trace(part: tuple[str, int, str], site: SiteFile, scene: Scene) -> StationTrace:
