@@ -1,6 +1,7 @@
 """The command line. Every error that rayfix foresees is one line on standard error and exit status 2."""
 
 import argparse
+import dataclasses
 import json
 import sys
 from collections.abc import Sequence
@@ -29,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"rayfix: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("rayfix: interrupted; nothing half done was left behind", file=sys.stderr)
+        print("rayfix: interrupted; finished work is kept, run the same command again to go on", file=sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stderr.close()
@@ -60,7 +61,9 @@ def _parser() -> argparse.ArgumentParser:
     build.add_argument("site", type=Path, metavar="SITE.toml")
     build.add_argument("-o", "--output", type=Path, required=True, metavar="T.h5")
     build.add_argument("--jobs", type=_jobs, default=-1, help="cells fitted at a time (default: one per core)")
+    build.add_argument("--cluster", metavar="ADDRESS", help="let the workers of this Dask scheduler fit the cells")
     build.add_argument("--no-progress", action="store_true", help="show no progress bar")
+    build.add_argument("--json", action="store_true", help="print the summary as JSON")
 
     info = add("info", _info, "show what a table holds")
     info.add_argument("table", type=Path, metavar="T.h5")
@@ -129,10 +132,15 @@ def _build(options: argparse.Namespace) -> int:
     from rayfix.console import build_progress, print_build_summary
 
     with build_progress(enabled=not options.no_progress) as progress:
-        summary = build_table(options.site, options.output, jobs=options.jobs, progress=progress)
+        summary = build_table(
+            options.site, options.output, jobs=options.jobs, cluster=options.cluster, progress=progress
+        )
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    print_build_summary(summary)
+    if options.json:
+        print(json.dumps(dataclasses.asdict(summary), indent=2, default=str))
+    else:
+        print_build_summary(summary)
     return 0
 
 

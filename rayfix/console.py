@@ -58,13 +58,14 @@ def print_build_summary(summary: "BuildSummary") -> None:
     grid = Grid(
         "station", title=f"Table {summary.path}", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1)
     )
-    for heading in ("cells", "filled", "components", "MB", "lost"):
+    for heading in ("", "cells", "filled", "components", "MB", "lost"):
         grid.add_column(heading, justify="right")
     for k in range(max(len(s.coverage) for s in summary.stations)):
         grid.add_column(f"<= {k}", justify="right")
     for s in summary.stations:
         grid.add_row(
             s.station_id,
+            s.origin,
             str(s.num_cells),
             str(s.num_filled_cells),
             str(s.num_components),
@@ -79,7 +80,8 @@ def print_build_summary(summary: "BuildSummary") -> None:
     console = Console()
     console.print(grid)
     console.print(
-        f"{summary.num_bytes / 1e6:.1f} MB in {summary.seconds:.1f} s; table_id {summary.table_id}",
+        f"{summary.num_bytes / 1e6:.1f} MB in {summary.seconds:.1f} s, at most {summary.peak_bytes / 1e9:.1f} GB of "
+        f"memory; table_id {summary.table_id}",
         highlight=False,
         soft_wrap=True,
     )

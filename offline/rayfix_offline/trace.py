@@ -4,6 +4,7 @@ import hashlib
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rayfix_offline.launch import RaySet, Sequences, launch, sample_rays, thin
 from rayfix_offline.pathprior import GainModel, fill_path_prior
@@ -65,6 +66,10 @@ class StationTrace:
     levels: tuple[LevelRays, ...]
     lost_ray_share: float
     coverage: tuple[float, ...]
+
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        """Return what the launch found out, as the arrays of a shard."""
+        return {"lost_ray_share": np.array(self.lost_ray_share), "coverage": np.array(self.coverage)}
 
 
 def level_grid(window: float) -> AngularGrid:

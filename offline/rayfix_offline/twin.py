@@ -63,7 +63,11 @@ def prepare_twin(site: SiteFile, folder: Path) -> Twin:
     SceneError
         When the scene cannot be read. What is wrong with a readable scene is in the twin's findings.
     """
-    scene = load_scene(folder / site.site.scene, unit=site.site.scene_unit, up=site.site.scene_up)
+    return prepare_scene(site, load_scene(folder / site.site.scene, unit=site.site.scene_unit, up=site.site.scene_up))
+
+
+def prepare_scene(site: SiteFile, scene: Scene) -> Twin:
+    """Check a scene that is loaded already; see :func:`prepare_twin`."""
     parts = split_parts(scene)
     stations = np.array([station.position_m for station in site.stations])
     enclosing, inside = find_enclosures(scene, parts, stations)

@@ -73,6 +73,7 @@ class StationPart:
     levels: tuple[Level, ...]
     lost_ray_share: float
     coverage: tuple[float, ...]
+    part_id: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,6 +147,7 @@ class Table:
                 levels=levels,
                 lost_ray_share=float(group.attrs["lost_ray_share"]),
                 coverage=tuple(float(share) for share in group.attrs["coverage"]),
+                part_id=str(group.attrs["part_id"]),
             )
         return cls(
             path=path,

@@ -68,11 +68,14 @@ class StationContent:
         Share of the launched rays that left the scene without having come to their last reflection.
     coverage : tuple of float
         Share of the free space that is reached with at most 0, 1, 2, ... reflections.
+    part_id : str
+        Names all that decided the part's content, so that a later build can tell whether it is still right.
     """
 
     levels: tuple[LevelContent, ...]
     lost_ray_share: float
     coverage: tuple[float, ...]
+    part_id: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,6 +209,7 @@ def _write_content(
         group.attrs["position_m"] = np.asarray(station.position)
         group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
         group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
+        group.attrs["part_id"] = content.part_id
         group.attrs["lost_ray_share"] = content.lost_ray_share
         group.attrs["coverage"] = np.asarray(content.coverage)
         for n, level in enumerate(content.levels):

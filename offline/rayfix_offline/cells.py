@@ -1,0 +1,79 @@
+"""Cells that have been fitted: the result of a block, and what becomes of blocks in a shard and in a level."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.em import ExpectationMaximisation, fit_em
+from rayfix_offline.site import SiteFile
+from rayfix_offline.trace import LevelRays
+from rayfix_offline.tubes import TubeFit, fit_tubes
+from rayfix_tables.grid import AngularGrid
+from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+from rayfix_tables.write import LevelContent
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedCells:
+    """Fitted cells of a block.
+
+    Attributes
+    ----------
+    cells : ndarray of int64, shape (n_cells,)
+    counts : ndarray of int64, shape (n_cells,)
+        Components of each cell.
+    log_mass : ndarray of shape (n_cells,)
+    mixture : TubeMixture
+        Components of all cells.
+    """
+
+    cells: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    log_mass: NDArray[np.float64]
+    mixture: TubeMixture
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a shard."""
+        fields = {name: getattr(self.mixture, name) for name in FIELD_SHAPES}
+        return {"cells": self.cells, "counts": self.counts, "log_mass": self.log_mass, **fields}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> "FittedCells":
+        """Take up what :meth:`to_arrays` gave."""
+        mixture = TubeMixture(**{name: arrays[name] for name in FIELD_SHAPES})
+        return cls(cells=arrays["cells"], counts=arrays["counts"], log_mass=arrays["log_mass"], mixture=mixture)
+
+
+def fit_cells(cells: NDArray[np.int64], level: LevelRays, site: SiteFile) -> FittedCells:
+    """Fit cells of a level in the way that the site asks for."""
+    centres = level.grid.centres[cells]
+    if site.table.fit == "em":
+        counts, log_mass, mixture = fit_em(centres, cells, level, ExpectationMaximisation(seed=site.table.seed))
+    else:
+        counts, log_mass, mixture = fit_tubes(centres, level, TubeFit())
+    return FittedCells(cells=cells, counts=counts, log_mass=log_mass, mixture=mixture)
+
+
+def assemble_level(window: float, grid: AngularGrid, parts: Sequence[FittedCells]) -> LevelContent:
+    """Put the blocks of a level together.
+
+    Parameters
+    ----------
+    window : float, rad
+    parts : sequence of FittedCells
+        In the order of their cells; cells that are in none stay empty.
+    """
+    counts = np.zeros(grid.num_cells, np.int64)
+    log_mass = np.full(grid.num_cells, -np.inf)
+    for part in parts:
+        counts[part.cells], log_mass[part.cells] = part.counts, part.log_mass
+    return LevelContent(
+        window=window,
+        grid=grid,
+        cell_offsets=np.concatenate([[0], np.cumsum(counts)]),
+        cell_log_mass=log_mass,
+        mixture=TubeMixture.concatenate([part.mixture for part in parts]),
+    )
