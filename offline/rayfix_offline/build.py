@@ -1,9 +1,11 @@
 """The offline job: a site file and its scene become a table."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -106,10 +108,11 @@ def build_table(
         for level, cells in zip(trace.levels, view, strict=True):
             stage = f"{station.id}: {np.rad2deg(level.window):g} deg cells"
             parts = []
-            for block, fitted in _fit_blocks(cells, level, site, jobs):
-                parts.append((block, fitted))
-                done += len(block)
-                report(stage, done, total)
+            with closing(_fit_blocks(cells, level, site, jobs)) as blocks:
+                for block, fitted in blocks:
+                    parts.append((block, fitted))
+                    done += len(block)
+                    report(stage, done, total)
             levels.append(_level_content(level, parts))
         contents.append(
             StationContent(levels=tuple(levels), lost_ray_share=trace.lost_ray_share, coverage=trace.coverage)
@@ -147,7 +150,7 @@ def _cells_in_view(station: Station, site: SiteFile) -> list[NDArray[np.int64]]:
 
 def _fit_blocks(
     cells: NDArray[np.int64], level: LevelRays, site: SiteFile, jobs: int
-) -> Iterator[tuple[NDArray[np.int64], FittedCells]]:
+) -> Generator[tuple[NDArray[np.int64], FittedCells], None, None]:
     """Fit the cells of a level in parallel, block by block, in their order."""
     blocks = [cells[i : i + BLOCK_CELLS] for i in range(0, len(cells), BLOCK_CELLS)]
     centres = level.grid.centres
@@ -160,7 +163,13 @@ def _fit_blocks(
         # The compiled kernels release the lock, so threads share the rays without a copy.
         tasks = (delayed(fit_tubes)(centres[b], level, TubeFit()) for b in blocks)
         results = Parallel(n_jobs=jobs, prefer="threads", return_as="generator")(tasks)
-    yield from zip(blocks, results, strict=True)
+    try:
+        yield from zip(blocks, results, strict=True)
+    finally:
+        # After Ctrl-C joblib warns that tasks are cancelled, which is as it should be.
+        with catch_warnings():
+            simplefilter("ignore", UserWarning)
+            results.close()
 
 
 def _level_content(level: LevelRays, parts: list[tuple[NDArray[np.int64], FittedCells]]) -> LevelContent:
