@@ -103,6 +103,20 @@ def test_reduction_to_a_number(seed: int, count: int, size: int, most: int) -> N
         np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-9)
 
 
+def test_a_merged_component_can_become_the_best_partner_of_another() -> None:
+    """One of a thousand random mixtures in the plane where that decides what is merged; found by search."""
+    rng = np.random.default_rng(304)
+    count, size = int(rng.integers(4, 14)), int(rng.choice([1, 2]))
+    weight = rng.dirichlet(np.full(count, rng.choice([0.2, 1.0, 5.0])))
+    mean = rng.normal(size=(count, size)) * rng.choice([0.5, 1.0, 3.0])
+    roots = rng.normal(size=(count, size, size))
+    cov = roots @ np.swapaxes(roots, 1, 2) * rng.choice([1.0, 0.1]) + 0.05 * np.eye(size)
+    found, label = sort(*reduce((weight, mean, cov), 2, NEVER))
+    expected, its_label = sort(*naive((weight, mean, cov), list(range(count)), 2, NEVER))
+    assert label == its_label
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-12)
+
+
 @settings(max_examples=40, deadline=None)
 @given(seed=seeds, count=st.integers(2, 12), most=st.integers(1, 12), limit=st.floats(1e-4, 1.0))
 def test_reduction_to_a_cost(seed: int, count: int, most: int, limit: float) -> None:

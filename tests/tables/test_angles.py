@@ -49,6 +49,17 @@ def test_wrap_at_the_seam(angle: float, wrapped: float) -> None:
     assert float(wrap(angle)) == wrapped
 
 
+def test_wrap_next_to_all_half_turns() -> None:
+    """The quotient by a turn is rounded to a half from either side."""
+    for turns in np.arange(-40, 41) / 2.0:
+        angle = turns * 2.0 * np.pi
+        for _ in range(4):
+            wrapped = float(wrap(angle))
+            assert -np.pi < wrapped <= np.pi
+            assert abs(math.remainder(angle - wrapped, 2.0 * np.pi)) <= 4.0 * np.spacing(max(abs(angle), np.pi))
+            angle = np.nextafter(angle, np.inf)
+
+
 @settings(deadline=None)
 @given(azimuths, st.floats(-0.9, 0.9), st.integers(-3, 3))
 def test_a_difference_across_the_seam_is_the_small_one(azimuth: float, step: float, turns: int) -> None:

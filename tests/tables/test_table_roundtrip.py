@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
-from rayfix_tables.schema import FORMAT_VERSION
+from rayfix_tables.schema import FORMAT_VERSION, array_digest
 from rayfix_tables.site import Station
 from rayfix_tables.table import Table
 
@@ -166,6 +166,14 @@ def test_the_id_does_not_tell_who_wrote_it_where(make_content: Callable[..., Any
     assert first == second
     assert len(first) == 64
     assert Table.open(tmp_path / "a.h5").software_version != Table.open(tmp_path / "folder/b.h5").software_version
+
+
+def test_a_digest_is_of_type_shape_and_bytes() -> None:
+    array = np.arange(6, dtype=np.int64)
+    others = [array.reshape(2, 3), array.reshape(3, 2), array.view(np.uint64), array[::-1], array[:5], array[:0]]
+    assert len({array_digest(other) for other in [array, *others]}) == 7
+    whole = np.arange(12).reshape(3, 4)
+    assert array_digest(whole[:, ::2]) == array_digest(whole[:, ::2].copy())
 
 
 def nudged(array: np.ndarray) -> np.ndarray:
