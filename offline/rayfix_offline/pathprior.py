@@ -17,26 +17,6 @@ from rayfix_tables.freespace import FreeSpace
 
 
 @dataclass(frozen=True, kw_only=True)
-class GainModel:
-    """Power gain of a path, relative to 1 m of free space.
-
-    Attributes
-    ----------
-    loss_db : float
-        Loss of each reflection.
-    exponent : float
-        beta; 0 takes any path for as likely, a large one only the strongest.
-    """
-
-    loss_db: float
-    exponent: float
-
-    def reflection_factors(self, max_reflections: int) -> NDArray[np.float64]:
-        """Factor that 0, 1, 2, ... reflections put on gain^beta, shape (max_reflections + 1,)."""
-        return np.asarray(10.0 ** (-0.1 * self.loss_db * self.exponent * np.arange(max_reflections + 1)))
-
-
-@dataclass(frozen=True, kw_only=True)
 class PathPrior:
     """The sum of gain^beta over all paths to a voxel.
 
@@ -56,13 +36,20 @@ class PathPrior:
     coverage: tuple[float, ...]
 
 
+def reflection_factors(segments: Segments, exponent: float) -> NDArray[np.float64]:
+    """Factor that reflections put on gain^beta, shape (n_rays, max_reflections + 1)."""
+    return np.asarray(10.0 ** (segments.log_gain * exponent))
+
+
 def fill_path_prior(
-    rays: RaySet, segments: Segments, gain: GainModel, free_space: FreeSpace, *, refinement: int
+    rays: RaySet, segments: Segments, free_space: FreeSpace, *, exponent: float, refinement: int
 ) -> PathPrior:
     """Fill the voxel map of one station.
 
     Parameters
     ----------
+    exponent : float
+        beta; 0 takes any path for as likely, a large one only the strongest.
     refinement : int
         A voxel of the map is this many voxels of the free space wide.
     """
@@ -84,8 +71,8 @@ def fill_path_prior(
         segments.sequences.mirrors,
         rays.directions,
         rays.solid_angle,
-        gain.reflection_factors(depths - 1),
-        gain.exponent,
+        reflection_factors(segments, exponent),
+        exponent,
         free_space.origin,
         voxel_size,
         power,
@@ -137,5 +124,5 @@ def _fill(
                 iz = int(np.floor((images[seq, 2] + length * heading[2] - origin[2]) / voxel))
                 if 0 <= ix < nx and 0 <= iy < ny and 0 <= iz < nz:
                     volume = solid_angle[ray] * length * length * span / steps
-                    power[ix, iy, iz] += volume * factors[depth] * length ** (-2.0 * exponent)
+                    power[ix, iy, iz] += volume * factors[ray, depth] * length ** (-2.0 * exponent)
                     reached[ix, iy, iz] = min(reached[ix, iy, iz], depth)

@@ -1,0 +1,105 @@
+"""Sampled directions stand for the whole sphere, and thinned ones still do."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from rayfix_offline.launch import RaySet, sample_rays, thin
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def cells_of(rays: RaySet) -> NDArray[np.int64]:
+    """Cell that each ray lies in."""
+    return rays.grid.nearest(rays.azimuth, rays.zenith)
+
+
+@settings(max_examples=25, deadline=None)
+@given(spacing=st.floats(0.03, 0.5), seed=seeds)
+def test_one_ray_in_each_cell(spacing: float, seed: int) -> None:
+    rays = sample_rays(spacing, np.random.default_rng(seed))
+    np.testing.assert_array_equal(cells_of(rays), np.arange(len(rays)))
+    assert rays.solid_angle.sum() == pytest.approx(4.0 * np.pi, rel=1e-12)
+    assert np.pi / rays.grid.num_rings <= spacing
+    np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=1), 1.0, rtol=0, atol=1e-15 * 4)
+
+
+def test_rays_are_uniform_on_the_sphere() -> None:
+    """The integrals of the first and second moments, over 30 draws of about 5,000 rays.
+
+    Within a cell of 0.05 rad a draw deviates by 0.05 / sqrt(6) at most, so the sum over the sphere, 4 pi, deviates by
+    0.05^2 0.05 / sqrt(6) sqrt(5000 * 30) / 30 = 7e-4.
+    """
+    first, second = np.zeros(3), np.zeros((3, 3))
+    for seed in range(30):
+        rays = sample_rays(0.05, np.random.default_rng(seed))
+        first += rays.solid_angle @ rays.directions / 30
+        second += np.einsum("n,ni,nj->ij", rays.solid_angle, rays.directions, rays.directions) / 30
+    np.testing.assert_allclose(first, 0.0, rtol=0, atol=4 * 7e-4)
+    np.testing.assert_allclose(second, 4.0 * np.pi / 3.0 * np.eye(3), rtol=0, atol=4 * 7e-4)
+
+
+def test_within_a_ring_the_cosine_is_uniform() -> None:
+    """In the ring at the zenith, where sin changes most, the mean of the cosine is that of its edges."""
+    num_rings = sample_rays(0.4, np.random.default_rng(0)).grid.num_rings
+    low = np.cos(np.pi / num_rings)
+    cosines = []
+    for seed in range(2000):
+        rays = sample_rays(0.4, np.random.default_rng(seed))
+        cosines.append(np.cos(rays.zenith[: rays.grid.ring_cells[0]]))
+    place = (np.concatenate(cosines) - low) / (1.0 - low)
+    assert np.all((place >= 0.0) & (place <= 1.0))
+    deviation = np.sqrt(1.0 / 12.0 / len(place))
+    assert abs(place.mean() - 0.5) < 4.0 * deviation
+
+
+def test_the_seed_decides() -> None:
+    first, again, other = (sample_rays(0.1, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.directions, again.directions)
+    assert np.abs(first.directions - other.directions).max() > 0.01
+
+
+@settings(max_examples=25, deadline=None)
+@given(spacing=st.floats(0.03, 0.2), ratio=st.floats(2.1, 5.0), seed=seeds)
+def test_thinned_rays_lie_one_in_each_coarse_cell(spacing: float, ratio: float, seed: int) -> None:
+    rays = sample_rays(spacing, np.random.default_rng(seed))
+    thinned, index = thin(rays, ratio * spacing)
+    np.testing.assert_array_equal(cells_of(thinned), np.arange(len(thinned)))
+    np.testing.assert_array_equal(thinned.directions, rays.directions[index])
+    assert len(np.unique(index)) == len(thinned) < len(rays) / 2
+    assert thinned.solid_angle.sum() == pytest.approx(4.0 * np.pi, rel=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(spacing=st.floats(0.03, 0.2), seed=seeds)
+def test_rays_can_be_thinned_to_twice_their_spacing(spacing: float, seed: int) -> None:
+    """A cell that no ray happens to lie in takes one from a neighbour."""
+    rays = sample_rays(spacing, np.random.default_rng(seed))
+    thinned, index = thin(rays, 2.0 * spacing)
+    np.testing.assert_array_equal(thinned.directions, rays.directions[index])
+    assert np.count_nonzero(cells_of(thinned) != np.arange(len(thinned))) <= 2
+    centres = np.stack(
+        [
+            np.sin(thinned.grid.centres[:, 1]) * np.cos(thinned.grid.centres[:, 0]),
+            np.sin(thinned.grid.centres[:, 1]) * np.sin(thinned.grid.centres[:, 0]),
+            np.cos(thinned.grid.centres[:, 1]),
+        ],
+        axis=-1,
+    )
+    assert np.linalg.norm(thinned.directions - centres, axis=1).max() < 2.0 * spacing
+
+
+def test_windows_at_a_ratio_of_four_can_leave_a_cell_empty() -> None:
+    """Rays of windows 6.53 and 26.12 deg with this seed; cell 2224 of 2,734 holds none of the finer rays."""
+    rays = sample_rays(np.deg2rad(6.53) / 3.0, np.random.default_rng(2876))
+    thinned, _ = thin(rays, np.deg2rad(26.12) / 6.0)
+    assert 2224 not in thinned.grid.nearest(rays.azimuth, rays.zenith)
+    assert np.flatnonzero(cells_of(thinned) != np.arange(len(thinned))).tolist() == [2224]
+
+
+def test_rays_cannot_be_made_denser() -> None:
+    rays = sample_rays(0.1, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="hardly finer"):
+        thin(rays, 0.11)
