@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.engine import RayEngine
+from rayfix_offline.materials import Reflectivity
 from rayfix_offline.planes import Planes
 from rayfix_tables.angles import direction
 from rayfix_tables.grid import AngularGrid
@@ -79,6 +80,8 @@ class Segments:
         Reflection sequence of the piece, -1 where the ray has ended before.
     start, end : ndarray of that shape, m
         Path lengths at which the piece begins and ends.
+    log_gain : ndarray of that shape
+        Logarithm to base 10 of the share of the power that the reflections before the piece left, 0 before the first.
     lost_ray_share : float
         Share of the rays that left the scene instead of hitting a surface.
     """
@@ -86,6 +89,7 @@ class Segments:
     sequence: NDArray[np.int32]
     start: NDArray[np.float64]
     end: NDArray[np.float64]
+    log_gain: NDArray[np.float64]
     sequences: Sequences
     lost_ray_share: float
 
@@ -141,6 +145,7 @@ def launch(
     *,
     engine: RayEngine,
     planes: Planes,
+    reflectivity: Reflectivity,
     bounds: NDArray[np.float64],
     max_reflections: int,
     max_path_length: float,
@@ -152,6 +157,8 @@ def launch(
     station : ndarray of shape (3,), m
     directions : ndarray of shape (n_rays, 3)
         Unit vectors.
+    reflectivity : Reflectivity
+        Of the engine's triangles.
     bounds : ndarray of shape (2, 3), m
         Low and high corner of the scene; a ray that hits nothing ends there.
     max_path_length : float, m
@@ -162,6 +169,7 @@ def launch(
     sequence = np.full((num_rays, max_reflections + 1), -1, np.int32)
     start = np.zeros(sequence.shape)
     end = np.zeros(sequence.shape)
+    log_gain = np.zeros(sequence.shape)
     images, mirrors = [station[None, :]], [np.eye(3)[None]]
     parents, sequence_planes, depths = [np.array([-1])], [np.array([-1])], [np.array([0])]
     num_sequences = 1
@@ -169,6 +177,7 @@ def launch(
     rays = np.arange(num_rays)
     current = np.zeros(num_rays, np.int64)
     length = np.zeros(num_rays)
+    reflected = np.zeros(num_rays)
     image = np.broadcast_to(station, (num_rays, 3))
     heading = directions
     origin = image
@@ -187,11 +196,13 @@ def launch(
         sequence[rays, depth] = current
         start[rays, depth] = length
         end[rays, depth] = stop
+        log_gain[rays, depth] = reflected
         lost += int(np.count_nonzero(~hit))
         if depth == max_reflections:
             break
         on = np.flatnonzero(hit & (reach < max_path_length))
         rays, plane, normal, approach, length = rays[on], plane[on], normal[on], approach[on], reach[on]
+        reflected = reflected[on] + reflectivity.log_gain(faces[on], np.abs(approach))
         keys, inverse = np.unique(current[on] * len(planes) + plane, return_inverse=True)
         parent, mirror_plane = keys // len(planes), keys % len(planes)
         all_images, all_mirrors = np.concatenate(images), np.concatenate(mirrors)
@@ -213,6 +224,7 @@ def launch(
         sequence=sequence,
         start=start,
         end=end,
+        log_gain=log_gain,
         sequences=Sequences(
             images=np.concatenate(images),
             mirrors=np.concatenate(mirrors),

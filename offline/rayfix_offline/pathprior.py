@@ -24,26 +24,6 @@ miss others alike: 10 % of noise in the map, however many rays there are.
 
 
 @dataclass(frozen=True, kw_only=True)
-class GainModel:
-    """Power gain of a path, relative to 1 m of free space.
-
-    Attributes
-    ----------
-    loss_db : float
-        Loss of each reflection.
-    exponent : float
-        beta; 0 takes any path for as likely, a large one only the strongest.
-    """
-
-    loss_db: float
-    exponent: float
-
-    def reflection_factors(self, max_reflections: int) -> NDArray[np.float64]:
-        """Factor that 0, 1, 2, ... reflections put on gain^beta, shape (max_reflections + 1,)."""
-        return np.asarray(10.0 ** (-0.1 * self.loss_db * self.exponent * np.arange(max_reflections + 1)))
-
-
-@dataclass(frozen=True, kw_only=True)
 class PathPrior:
     """The sum of gain^beta over all paths to a voxel.
 
@@ -63,13 +43,20 @@ class PathPrior:
     coverage: tuple[float, ...]
 
 
+def reflection_factors(segments: Segments, exponent: float) -> NDArray[np.float64]:
+    """Factor that reflections put on gain^beta, shape (n_rays, max_reflections + 1)."""
+    return np.asarray(10.0 ** (segments.log_gain * exponent))
+
+
 def fill_path_prior(
-    rays: RaySet, segments: Segments, gain: GainModel, free_space: FreeSpace, *, refinement: int
+    rays: RaySet, segments: Segments, free_space: FreeSpace, *, exponent: float, refinement: int
 ) -> PathPrior:
     """Fill the voxel map of one station.
 
     Parameters
     ----------
+    exponent : float
+        beta; 0 takes any path for as likely, a large one only the strongest.
     refinement : int
         A voxel of the map is this many voxels of the free space wide.
     """
@@ -91,8 +78,8 @@ def fill_path_prior(
         segments.sequences.mirrors,
         rays.directions,
         rays.solid_angle,
-        gain.reflection_factors(depths - 1),
-        gain.exponent,
+        reflection_factors(segments, exponent),
+        exponent,
         free_space.origin,
         voxel_size,
         power,
@@ -147,5 +134,5 @@ def _fill(
                     volume = solid_angle[ray] * length * length * span / steps
                     # Bounded next to the station, where a voxel's mean gain has no limit.
                     reach = max(length, 0.5 * voxel)
-                    power[ix, iy, iz] += volume * factors[depth] * reach ** (-2.0 * exponent)
+                    power[ix, iy, iz] += volume * factors[ray, depth] * reach ** (-2.0 * exponent)
                     reached[ix, iy, iz] = min(reached[ix, iy, iz], depth)

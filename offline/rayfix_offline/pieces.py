@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.launch import RaySet, Segments
-from rayfix_offline.pathprior import GainModel, PathPrior
+from rayfix_offline.pathprior import PathPrior, reflection_factors
 
 FIRST_NODE = 0.25
 """Length of the first slice node, m; whatever is nearer belongs to it."""
@@ -66,9 +66,9 @@ class Pieces:
 def cut_pieces(
     rays: RaySet,
     segments: Segments,
-    gain: GainModel,
     prior: PathPrior,
     *,
+    exponent: float,
     kind: Literal["power", "uniform", "paper"],
     slice_ratio: float,
     step: float,
@@ -77,6 +77,8 @@ def cut_pieces(
 
     Parameters
     ----------
+    exponent : float
+        The prior's beta.
     kind : {"power", "uniform", "paper"}
         Weight along a ray: s^2 pi, s^2, or 1.
     slice_ratio : float
@@ -102,8 +104,8 @@ def cut_pieces(
         segments.sequences.images,
         segments.sequences.mirrors,
         rays.directions,
-        gain.reflection_factors(segments.sequence.shape[1] - 1),
-        gain.exponent,
+        reflection_factors(segments, exponent),
+        exponent,
         prior.origin,
         prior.voxel_size,
         prior.total,
@@ -209,8 +211,9 @@ def _cut(
                         ix = min(max(ix, 0), nx - 1)
                         iy = min(max(iy, 0), ny - 1)
                         iz = min(max(iz, 0), nz - 1)
-                        own = factors[depth] * length ** (-2.0 * exponent)
-                        weight *= min(1.0, own / max(total[ix, iy, iz], own))
+                        own = factors[ray, depth] * length ** (-2.0 * exponent)
+                        # A path so weak that its gain^beta is 0 is never reported.
+                        weight *= min(1.0, own / max(total[ix, iy, iz], own)) if own > 0.0 else 0.0
                     share = _node(length, log_ratio) - n
                     for side in range(2):
                         part = weight * (share if side else 1.0 - share)

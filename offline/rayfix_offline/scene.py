@@ -15,10 +15,11 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.units import unit_conversion
 
+from rayfix_offline.mitsuba import Placed, read_mitsuba
 from rayfix_tables.errors import SceneError
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-FILE_TYPES = ("glb", "gltf", "obj", "ply", "stl", "dae")
+FILE_TYPES = ("glb", "gltf", "obj", "ply", "stl", "dae", "xml")
 
 _MIN_AREA = 1e-12
 
@@ -90,19 +91,19 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
     kind = path.suffix.lower().lstrip(".")
     if kind not in FILE_TYPES:
         raise SceneError(f"{path} is of unknown type '{kind}'; give one of {', '.join(FILE_TYPES)}")
-    loaded = _load_quietly(path)
-    meshes: list[tuple[str, Any, Any]] = []
-    for node in loaded.graph.nodes_geometry:
-        transform, name = loaded.graph[node]
-        geometry = loaded.geometry[name]
-        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            if not (np.all(np.isfinite(geometry.vertices)) and np.all(np.isfinite(transform))):
-                raise SceneError(f"{path} has coordinates that are not finite; export the scene again")
-            meshes.append((str(node), geometry, transform))
+    scale = METRES_PER_UNIT[unit]
+    if kind == "xml":
+        meshes = read_mitsuba(path, _load_quietly)
+    else:
+        loaded = _load_quietly(path)
+        meshes = _placed_meshes(loaded)
+        if kind == "dae":
+            # trimesh reads the unit of a COLLADA file (as "0.01 * meters"), but does not apply it.
+            scale = float(unit_conversion(loaded.units, "meters"))
     if not meshes:
         raise SceneError(f"{path} holds no triangles; export the scene as a triangle mesh")
-    # trimesh reads the unit of a COLLADA file (as "0.01 * meters"), but does not apply it.
-    scale = float(unit_conversion(loaded.units, "meters")) if kind == "dae" else METRES_PER_UNIT[unit]
+    if not all(np.isfinite(mesh.vertices).all() and np.isfinite(transform).all() for _, mesh, transform in meshes):
+        raise SceneError(f"{path} has coordinates that are not finite; export the scene again")
     scene = _gather(meshes, scale=scale, up=up)
     if not len(scene.faces):
         raise SceneError(f"{path} has only triangles without an area; export the scene again")
@@ -124,7 +125,18 @@ def _load_quietly(path: Path) -> Any:
         logging.disable(previous)
 
 
-def _gather(meshes: list[tuple[str, Any, Any]], *, scale: float, up: str) -> Scene:
+def _placed_meshes(loaded: Any) -> list[Placed]:
+    """Triangle meshes of all nodes of a trimesh scene."""
+    meshes = []
+    for node in loaded.graph.nodes_geometry:
+        transform, name = loaded.graph[node]
+        geometry = loaded.geometry[name]
+        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+            meshes.append((str(node), geometry, transform))
+    return meshes
+
+
+def _gather(meshes: list[Placed], *, scale: float, up: str) -> Scene:
     turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) if up == "y" else np.eye(3)
     vertices, faces, face_materials, face_objects = [], [], [], []
     materials: list[str] = []

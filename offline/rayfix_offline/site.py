@@ -35,6 +35,7 @@ class PropagationSection(_Section):
     carrier_ghz: Annotated[float, Field(gt=0, le=1000)] = 3.5
     max_reflections: Annotated[int, Field(ge=0, le=8)] = 3
     max_path_length_m: Annotated[float, Field(gt=0, le=10_000)] = 60.0
+    reflection: Literal["constant", "itu"] = "constant"
     reflection_loss_db: Annotated[float, Field(ge=0, le=100)] = 6.0
     path_prior: Literal["power", "uniform", "paper"] = "power"
     path_prior_exponent: Annotated[float, Field(ge=0, le=20)] = 2.0

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.engine import EmbreeEngine, RayEngine
+from rayfix_offline.materials import ITU_MATERIALS, complex_permittivity, itu_name
 from rayfix_offline.planes import Planes, merge_coplanar
 from rayfix_offline.scene import Scene, load_scene
 from rayfix_offline.site import SiteFile
@@ -74,6 +75,7 @@ def prepare_scene(site: SiteFile, scene: Scene) -> Twin:
     free_space = map_free_space(scene, parts, enclosing, voxel_size=VOXEL_SIZE)
     findings = [
         *_scene_findings(site, scene, parts, enclosing),
+        *_material_findings(site, scene),
         *_station_findings(site, scene, parts, enclosing, inside),
     ]
     if not free_space.free.any():
@@ -134,6 +136,35 @@ def _scene_findings(
     )
     if inverted:
         messages.append(f"solids whose triangles face inwards: {inverted}; harmless here, but mend the mesh")
+    return [Finding(severity="warning", message=message) for message in messages]
+
+
+def _material_findings(site: SiteFile, scene: Scene) -> list[Finding]:
+    """Where the constant loss stands in for a material."""
+    if site.propagation.reflection != "itu":
+        return []
+    messages = []
+    bare = np.count_nonzero(scene.face_materials < 0)
+    if bare:
+        messages.append(
+            f"{bare} of {len(scene.faces)} triangles have no material: reflection_loss_db is taken; give them one of "
+            "ITU-R P.2040, e.g. itu_concrete"
+        )
+    carrier = site.propagation.carrier_ghz
+    for n, name in enumerate(scene.materials):
+        if complex_permittivity(name, carrier) is not None or not np.any(scene.face_materials == n):
+            continue
+        known = itu_name(name)
+        if known is None:
+            messages.append(
+                f"material '{name}' unknown: reflection_loss_db is taken; ITU-R P.2040 has {', '.join(ITU_MATERIALS)}"
+            )
+        else:
+            ranges = " and ".join(f"{row.lowest_ghz:g} to {row.highest_ghz:g} GHz" for row in ITU_MATERIALS[known])
+            messages.append(
+                f"material '{name}' is known for {ranges} only, not at carrier_ghz = {carrier:g}: reflection_loss_db "
+                "is taken; choose another material"
+            )
     return [Finding(severity="warning", message=message) for message in messages]
 
 

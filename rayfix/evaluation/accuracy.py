@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rayfix.evaluation.bound import position_error_bound
 from rayfix.evaluation.forward import ForwardSolver, Paths
 from rayfix.evaluation.simulate import Noise, Timing, simulate_report, uniform_drops
+from rayfix_offline.materials import face_permittivity
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.wire import parse_report
 from rayfix_tables.freespace import FreeSpace
@@ -62,12 +63,17 @@ def clear_of_solids(free_space: FreeSpace, points: NDArray[np.float64], *, margi
 def solver_of(table: Table) -> ForwardSolver:
     """Return the forward solver of a table's scene, with the reflections and losses of its site."""
     propagation = table.site.document["propagation"]
+    scene = table.scene
+    permittivity = None
+    if propagation.get("reflection") == "itu":  # tables of before this key have none
+        permittivity = face_permittivity(scene.face_materials, scene.materials, propagation["carrier_ghz"])
     return ForwardSolver.from_mesh(
-        np.array(table.scene.vertices),
-        np.array(table.scene.faces),
+        np.array(scene.vertices),
+        np.array(scene.faces),
         max_reflections=propagation["max_reflections"],
         max_path_length=propagation["max_path_length_m"],
         reflection_loss_db=propagation["reflection_loss_db"],
+        face_permittivity=permittivity,
     )
 
 

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rayfix.evaluation.forward_kernels import trace_paths, visible
+from rayfix.evaluation.forward_kernels import hit_triangles, trace_paths, visible
+from rayfix.evaluation.fresnel import reflection_gain_db
 from rayfix.evaluation.images import ImageTree, MirrorScene, image_tree, mirror_scene
 
 __all__ = ["ForwardSolver", "Paths", "StationSolver"]
@@ -67,12 +68,16 @@ class ForwardSolver:
         Largest length of a path, m.
     reflection_loss_db : float
         Loss of each bounce, dB.
+    triangle_permittivity : ndarray of complex of shape (n_triangles,) or None
+        Complex relative permittivity of the scene's triangles; NaN where each bounce has the constant loss, and
+        None where all have it.
     """
 
     scene: MirrorScene
     max_reflections: int
     max_path_length: float
     reflection_loss_db: float
+    triangle_permittivity: NDArray[np.complex128] | None = None
 
     @classmethod
     def from_mesh(
@@ -83,6 +88,7 @@ class ForwardSolver:
         max_reflections: int = 3,
         max_path_length: float = 60.0,
         reflection_loss_db: float = 6.0,
+        face_permittivity: ArrayLike | None = None,
     ) -> "ForwardSolver":
         """Merge a mesh's coplanar triangles into mirrors and prepare the visibility tests.
 
@@ -98,6 +104,9 @@ class ForwardSolver:
             Largest length of a path, m.
         reflection_loss_db : float
             Loss of each bounce, dB.
+        face_permittivity : ndarray of complex of shape (n_faces,), optional
+            Complex relative permittivity of the triangles, which then reflect as half spaces; NaN for those that
+            have the constant loss.
 
         Returns
         -------
@@ -116,12 +125,22 @@ class ForwardSolver:
         if not max_path_length > 0.0:
             raise ValueError(f"max_path_length is {max_path_length} m; it must be positive")
         scene = mirror_scene(np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64))
+        permittivity = None
+        if face_permittivity is not None:
+            permittivity = np.asarray(face_permittivity, dtype=np.complex128)
+            if permittivity.shape != (len(np.asarray(faces)),):
+                raise ValueError(
+                    f"face_permittivity has the shape {permittivity.shape}; it must have one value for each of the "
+                    f"{len(np.asarray(faces))} faces"
+                )
+            permittivity = permittivity[scene.triangle_faces]
         return cls(
             scene=scene,
             max_reflections=max_reflections,
             # An int would compile the kernels a second time.
             max_path_length=float(max_path_length),
             reflection_loss_db=float(reflection_loss_db),
+            triangle_permittivity=permittivity,
         )
 
     @property
@@ -226,7 +245,7 @@ class StationSolver:
         horizontal = np.hypot(offset[:, 0], offset[:, 1])
         length = np.hypot(horizontal, offset[:, 2])
         num_reflections = (sequences >= 0).sum(axis=1)
-        gain = -20.0 * np.log10(length) - solver.reflection_loss_db * num_reflections
+        gain = -20.0 * np.log10(length) + self._reflection_gain_db(sequences, vertices)
         azimuth = np.arctan2(offset[:, 1], offset[:, 0])
         azimuth[azimuth <= -np.pi] = np.pi  # arctan2 of -0.0
         order = np.argsort(-gain, kind="stable")
@@ -238,6 +257,20 @@ class StationSolver:
             gain_db=gain[order],
             vertices=vertices[order],
         )
+
+    def _reflection_gain_db(self, sequences: NDArray[np.int64], vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum of the gains of each path's bounces, shape (n_paths,), dB."""
+        solver = self.solver
+        gain = np.where(sequences >= 0, -solver.reflection_loss_db, 0.0)
+        if solver.triangle_permittivity is not None:
+            triangles = hit_triangles(solver.scene, sequences, vertices)
+            permittivity = np.where(triangles >= 0, solver.triangle_permittivity[triangles], np.nan)
+            path, bounce = np.nonzero(np.isfinite(permittivity))
+            step = vertices[path, bounce + 1] - vertices[path, bounce]
+            normals = solver.scene.normals[sequences[path, bounce]]
+            cosine = np.abs(np.einsum("ij,ij->i", step, normals)) / np.linalg.norm(step, axis=1)
+            gain[path, bounce] = reflection_gain_db(np.minimum(cosine, 1.0), permittivity[path, bounce])
+        return np.asarray(gain.sum(axis=1))
 
 
 def _position(position: ArrayLike, name: str) -> NDArray[np.float64]:

@@ -150,6 +150,40 @@ def trace_paths(
 
 
 @njit(cache=True, nogil=True)
+def hit_triangles(
+    scene: "MirrorScene", sequences: NDArray[np.int64], vertices: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Find the triangles that paths are reflected at.
+
+    Parameters
+    ----------
+    scene : MirrorScene
+        The mirror planes and triangles.
+    sequences : ndarray of int of shape (n_paths, max_reflections)
+        Planes from the station to the point, then -1.
+    vertices : ndarray of shape (n_paths, max_reflections + 2, 3), m
+        Station, hits, point.
+
+    Returns
+    -------
+    ndarray of int of shape (n_paths, max_reflections)
+        The first triangle of the plane that holds the hit, -1 where there is no bounce.
+    """
+    out = np.full(sequences.shape, -1)
+    for i in range(sequences.shape[0]):
+        for bounce in range(sequences.shape[1]):
+            plane = sequences[i, bounce]
+            if plane < 0:
+                break
+            x, y, z = vertices[i, bounce + 1]
+            for triangle in range(scene.plane_starts[plane], scene.plane_starts[plane + 1]):
+                if _in_triangle(scene, triangle, x, y, z):
+                    out[i, bounce] = triangle
+                    break
+    return out
+
+
+@njit(cache=True, nogil=True)
 def visible(scene: "MirrorScene", start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether the straight segments from one point to others cross no triangle.
 

@@ -53,6 +53,8 @@ class MirrorScene(NamedTuple):
         ``facing[b, s, c]``: some of plane c lies on side s of plane b (0: against the normal, 1: along it).
     triangle_planes : ndarray of int of shape (n_triangles,)
         Plane of each triangle.
+    triangle_faces : ndarray of int of shape (n_triangles,)
+        The triangle's place among the mesh's faces.
     triangle_normals, triangle_offsets : ndarray of shape (n_triangles, 3) and (n_triangles,), 1 and m
         The triangle's own plane, which may differ from its mirror plane by the merging tolerance.
     edge_normals, edge_offsets : ndarray of shape (n_triangles, 3, 3) and (n_triangles, 3), 1 and m
@@ -77,6 +79,7 @@ class MirrorScene(NamedTuple):
     outline_sizes: NDArray[np.int64]
     facing: NDArray[np.bool_]
     triangle_planes: NDArray[np.int64]
+    triangle_faces: NDArray[np.int64]
     triangle_normals: NDArray[np.float64]
     triangle_offsets: NDArray[np.float64]
     edge_normals: NDArray[np.float64]
@@ -151,6 +154,7 @@ def mirror_scene(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Mir
 
     by_plane = np.argsort(planes, kind="stable")
     corners, triangle_normals, planes = corners[by_plane], triangle_normals[by_plane], planes[by_plane]
+    triangle_faces = np.flatnonzero(solid)[by_area][by_plane]
     starts = np.searchsorted(planes, np.arange(len(normals) + 1)).astype(np.int64)
     plane_low = np.minimum.reduceat(corners.min(axis=1), starts[:-1]) - _BOX_MARGIN
     plane_high = np.maximum.reduceat(corners.max(axis=1), starts[:-1]) + _BOX_MARGIN
@@ -169,6 +173,7 @@ def mirror_scene(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Mir
         outline_sizes=outline_sizes,
         facing=_facing(corners, starts, normals, offsets),
         triangle_planes=planes,
+        triangle_faces=triangle_faces,
         triangle_normals=triangle_normals,
         triangle_offsets=np.einsum("fi,fi->f", triangle_normals, corners[:, 0]),
         edge_normals=edge_normals,

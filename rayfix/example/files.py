@@ -14,7 +14,7 @@ _SITE = """\
 
 [site]
 name = "hall"
-scene = "{scene}"             # glb, gltf, obj, ply, stl or dae, relative to this file
+scene = "{scene}"             # glb, gltf, obj, ply, stl, dae or Mitsuba XML, relative to this file
 scene_unit = "m"              # applied when the scene file does not say
 scene_up = "z"                # "y" for glTF as most tools export it
 north_deg = 90.0              # azimuth of geographic north in the scene frame
@@ -23,7 +23,8 @@ north_deg = 90.0              # azimuth of geographic north in the scene frame
 carrier_ghz = 3.5
 max_reflections = 3
 max_path_length_m = 60.0
-reflection_loss_db = 6.0      # of each reflection
+reflection = "constant"       # "constant", or "itu": by the ITU-R P.2040 names of the mesh's materials
+reflection_loss_db = 6.0      # of each reflection; with "itu", of materials without such a name
 path_prior = "power"          # which path a station reports: "power", "uniform" or "paper"
 path_prior_exponent = 2.0     # how much the strong ones are preferred
 

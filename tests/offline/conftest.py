@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rayfix_offline.engine import EmbreeEngine
 from rayfix_offline.launch import Segments, launch
+from rayfix_offline.materials import Reflectivity, constant_reflectivity
 from rayfix_offline.planes import merge_coplanar
 
 ROOM = ((0.0, 0.0, 0.0), (4.0, 5.0, 3.0))
@@ -65,6 +66,8 @@ def launch_in() -> Callable[..., Segments]:
         *,
         max_reflections: int = 3,
         max_path_length: float = 1000.0,
+        loss_db: float = 6.0,
+        reflectivity: Reflectivity | None = None,
     ) -> Segments:
         corners = triangles.reshape(-1, 3)
         return launch(
@@ -72,6 +75,7 @@ def launch_in() -> Callable[..., Segments]:
             directions,
             engine=EmbreeEngine(triangles),
             planes=merge_coplanar(triangles),
+            reflectivity=reflectivity or constant_reflectivity(len(triangles), loss_db=loss_db),
             bounds=np.stack([corners.min(axis=0), corners.max(axis=0)]),
             max_reflections=max_reflections,
             max_path_length=max_path_length,

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 
 from rayfix_offline.launch import Segments, launch, sample_rays
+from rayfix_offline.materials import constant_reflectivity
 from rayfix_offline.planes import merge_coplanar
 
 Launch = Callable[..., Segments]
@@ -262,6 +263,7 @@ def test_a_hit_behind_the_ray_is_a_loss() -> None:
         directions,
         engine=Misled(),
         planes=merge_coplanar(wall),
+        reflectivity=constant_reflectivity(len(wall), loss_db=6.0),
         bounds=np.array([(0, -9, -9), (5, 9, 9)]),
         max_reflections=1,
         max_path_length=100.0,

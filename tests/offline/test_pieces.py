@@ -10,14 +10,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rayfix_offline.launch import RaySet, Segments, Sequences, sample_rays
-from rayfix_offline.pathprior import GainModel, PathPrior
+from rayfix_offline.pathprior import PathPrior
 from rayfix_offline.pieces import FIRST_NODE, Pieces, cut_pieces
 
 Launch = Callable[..., Segments]
 Kind = Literal["power", "uniform", "paper"]
 STATION = np.array([3.6, 0.4, 2.6])
 RATIO, STEP = 1.35, 0.1
-GAIN = GainModel(loss_db=6.0, exponent=1.0)
 
 
 def prior_of(value: float) -> PathPrior:
@@ -37,9 +36,9 @@ def segments(rays: RaySet, clutter: NDArray[np.float64], launch_in: Launch) -> S
     return launch_in(clutter, STATION, rays.directions, max_reflections=2)
 
 
-def cut(rays: RaySet, segments: Segments, kind: Kind, *, total: float = 1.0, gain: GainModel = GAIN) -> Pieces:
+def cut(rays: RaySet, segments: Segments, kind: Kind, *, total: float = 1.0) -> Pieces:
     """Cut with the usual settings."""
-    return cut_pieces(rays, segments, gain, prior_of(total), kind=kind, slice_ratio=RATIO, step=STEP)
+    return cut_pieces(rays, segments, prior_of(total), exponent=1.0, kind=kind, slice_ratio=RATIO, step=STEP)
 
 
 def ray_sums(pieces: Pieces, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -85,8 +84,7 @@ def test_the_voxel_of_the_point_decides(rays: RaySet, segments: Segments, axis: 
     total = np.ones((8, 10, 6))
     np.moveaxis(total, axis, 0)[total.shape[axis] // 2 :] = 4.0
     prior = PathPrior(origin=np.zeros(3), voxel_size=0.5, total=total, coverage=(1.0,))
-    gain = GainModel(loss_db=6.0, exponent=0.0)
-    pieces = cut_pieces(rays, segments, gain, prior, kind="power", slice_ratio=RATIO, step=0.001)
+    pieces = cut_pieces(rays, segments, prior, exponent=0.0, kind="power", slice_ratio=RATIO, step=0.001)
     sums = ray_sums(pieces, pieces.mass)
     sequences = segments.sequences
     for ray in range(0, len(rays), 20):
@@ -105,7 +103,7 @@ def test_the_voxel_of_the_point_decides(rays: RaySet, segments: Segments, axis: 
 def test_moments_of_each_piece(rays: RaySet, segments: Segments, kind: Kind) -> None:
     """Against a fine quadrature with hats that are interpolated between nodes at 0.25 m x 1.35^n."""
     fine = 0.001  # m
-    pieces = cut_pieces(rays, segments, GAIN, prior_of(1.0), kind=kind, slice_ratio=RATIO, step=fine)
+    pieces = cut_pieces(rays, segments, prior_of(1.0), exponent=1.0, kind=kind, slice_ratio=RATIO, step=fine)
     nodes = np.log(FIRST_NODE) + np.log(RATIO) * np.arange(25)
     for ray in range(0, len(rays), 15):
         mine = slice(pieces.offsets[ray], pieces.offsets[ray + 1])
@@ -174,11 +172,12 @@ def test_any_segment(start: float, span: float, ratio: float) -> None:
         sequence=np.zeros((1, 1), np.int32),
         start=np.array([[start]]),
         end=np.array([[end]]),
+        log_gain=np.zeros((1, 1)),
         sequences=sequences,
         lost_ray_share=0.0,
     )
     rays = sample_rays(0.5, np.random.default_rng(0))
-    pieces = cut_pieces(rays, segments, GAIN, prior_of(1.0), kind="paper", slice_ratio=ratio, step=STEP)
+    pieces = cut_pieces(rays, segments, prior_of(1.0), exponent=1.0, kind="paper", slice_ratio=ratio, step=STEP)
     assert pieces.mass.sum() == pytest.approx(span, rel=1e-9)
     mean = np.sum(pieces.mass * pieces.mean) / pieces.mass.sum()
     assert mean == pytest.approx(start + span / 2, rel=1e-9)
