@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.launch import RaySet, Sequences, launch, sample_rays, thin
-from rayfix_offline.pathprior import GainModel, fill_path_prior
+from rayfix_offline.materials import Reflectivity, constant_reflectivity, itu_reflectivity
+from rayfix_offline.pathprior import fill_path_prior
 from rayfix_offline.pieces import Pieces, cut_pieces
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin import Twin
@@ -77,6 +78,19 @@ def level_grid(window: float) -> AngularGrid:
     return AngularGrid.from_spacing(window / CELLS_PER_WINDOW)
 
 
+def reflectivity_of(site: SiteFile, twin: Twin) -> Reflectivity:
+    """Return what the triangles of a site's scene reflect."""
+    propagation, scene = site.propagation, twin.scene
+    if propagation.reflection == "constant":
+        return constant_reflectivity(len(scene.faces), loss_db=propagation.reflection_loss_db)
+    return itu_reflectivity(
+        scene.face_materials,
+        scene.materials,
+        carrier_ghz=propagation.carrier_ghz,
+        loss_db=propagation.reflection_loss_db,
+    )
+
+
 def trace_station(station: StationSection, site: SiteFile, twin: Twin) -> StationTrace:
     """Launch a station's rays and cut them into pieces.
 
@@ -91,17 +105,18 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin) -> Statio
         rays.directions,
         engine=twin.engine,
         planes=twin.planes,
+        reflectivity=reflectivity_of(site, twin),
         bounds=twin.scene.bounds,
         max_reflections=site.propagation.max_reflections,
         max_path_length=site.propagation.max_path_length_m,
     )
-    gain = GainModel(loss_db=site.propagation.reflection_loss_db, exponent=site.propagation.path_prior_exponent)
-    prior = fill_path_prior(rays, segments, gain, twin.free_space, refinement=PRIOR_REFINEMENT)
+    exponent = site.propagation.path_prior_exponent
+    prior = fill_path_prior(rays, segments, twin.free_space, exponent=exponent, refinement=PRIOR_REFINEMENT)
     pieces = cut_pieces(
         rays,
         segments,
-        gain,
         prior,
+        exponent=exponent,
         kind=site.propagation.path_prior,
         slice_ratio=SLICE_RATIO,
         step=INTEGRATION_STEP,
