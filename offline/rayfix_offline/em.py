@@ -5,7 +5,7 @@ Points are drawn from a cell's weighted ray pieces and a full-covariance Gaussia
 """
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +129,7 @@ def _fit_points(
             best = (bic, mixture)
     assert best is not None
     chosen = best[1]
-    floor = np.array([LENGTH_FLOOR, 0.0, 0.0, POSITION_FLOOR, POSITION_FLOOR, POSITION_FLOOR]) ** 2
+    floor = np.array([0.0, 0.0, 0.0, POSITION_FLOOR, POSITION_FLOOR, POSITION_FLOOR]) ** 2
     cov = chosen.covariances_ * np.outer(scale, scale) + np.diag(floor)
     member = chosen.predict(scaled)
     reflections = np.array(
@@ -139,9 +139,13 @@ def _fit_points(
         ],
         np.int8,
     )
-    return joint_to_tubes(
+    tubes = joint_to_tubes(
         np.log(np.maximum(chosen.weights_, 1e-12)),
         chosen.means_ * scale + points.mean(axis=0),
         cov,
         reflections,
     )
+    # The floor of the length lies along the tube: the position moves with it.
+    u_cov = tubes.u_cov.copy()
+    u_cov[:, 0] += LENGTH_FLOOR**2
+    return replace(tubes, u_cov=u_cov)

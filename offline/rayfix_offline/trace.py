@@ -23,7 +23,7 @@ RAYS_PER_WIDE_WINDOW = 6.0
 CELLS_PER_WINDOW = 0.8
 """Cells are this many times as close as their window's standard deviation."""
 
-SLICE_RATIO = 1.35
+SLICE_RATIO = 1.2
 """Ratio of a slice's length to the one before."""
 
 INTEGRATION_STEP = 0.1

@@ -32,7 +32,7 @@ class TubeFit:
     dropped_mass: float = 1e-4
     max_groups: int = 250
     max_components: int = 48
-    max_divergence: float = 1e-3
+    max_divergence: float = 1e-2
 
 
 def fit_tubes(
