@@ -58,7 +58,7 @@ def print_build_summary(summary: "BuildSummary") -> None:
     grid = Grid(
         "station", title=f"Table {summary.path}", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1)
     )
-    for heading in ("", "cells", "filled", "components", "MB", "lost"):
+    for heading in ("", "cells", "filled", "tubes", "MB", "lost"):
         grid.add_column(heading, justify="right")
     for k in range(max(len(s.coverage) for s in summary.stations)):
         grid.add_column(f"<= {k}", justify="right")
@@ -74,7 +74,7 @@ def print_build_summary(summary: "BuildSummary") -> None:
             *(f"{share:.0%}" for share in s.coverage),
         )
     grid.caption = (
-        "filled: cells that rays come to; lost: rays that left the scene; "
+        "filled: cells that rays come to; tubes: components of their mixtures; lost: rays that left the scene; "
         "<= k: share of the free space that at most k reflections reach"
     )
     console = Console()
