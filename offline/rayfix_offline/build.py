@@ -25,7 +25,7 @@ from rayfix_offline.twin import Twin, prepare_twin, refuse_errors
 from rayfix_tables.errors import BuildError, TableError
 from rayfix_tables.table import StationPart, Table
 from rayfix_tables.version import software_version
-from rayfix_tables.write import LevelContent, SceneContent, StationContent, check_writable, write_table
+from rayfix_tables.write import SceneContent, StationContent, check_writable, write_table
 
 if TYPE_CHECKING:
     from rayfix_offline.cluster import Cluster
@@ -264,16 +264,7 @@ def _reusable_parts(table_path: Path, wanted: set[str]) -> dict[str, StationPart
 def _kept_content(part: StationPart) -> StationContent:
     return StationContent(
         part_id=part.part_id,
-        levels=tuple(
-            LevelContent(
-                window=level.window,
-                grid=level.grid,
-                cell_offsets=level.cell_offsets,
-                cell_log_mass=level.cell_log_mass,
-                mixture=level.mixture,
-            )
-            for level in part.levels
-        ),
+        levels=part.levels,
         lost_ray_share=part.lost_ray_share,
         coverage=part.coverage,
     )

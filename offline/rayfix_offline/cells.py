@@ -12,8 +12,8 @@ from rayfix_offline.site import SiteFile
 from rayfix_offline.trace import LevelRays
 from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_tables.grid import AngularGrid
+from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
-from rayfix_tables.write import LevelContent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ def fit_cells(cells: NDArray[np.int64], level: LevelRays, site: SiteFile) -> Fit
     return FittedCells(cells=cells, counts=counts, log_mass=log_mass, mixture=mixture)
 
 
-def assemble_level(window: float, grid: AngularGrid, parts: Sequence[FittedCells]) -> LevelContent:
+def assemble_level(window: float, grid: AngularGrid, parts: Sequence[FittedCells]) -> Level:
     """Put the blocks of a level together.
 
     Parameters
@@ -70,7 +70,7 @@ def assemble_level(window: float, grid: AngularGrid, parts: Sequence[FittedCells
     log_mass = np.full(grid.num_cells, -np.inf)
     for part in parts:
         counts[part.cells], log_mass[part.cells] = part.counts, part.log_mass
-    return LevelContent(
+    return Level(
         window=window,
         grid=grid,
         cell_offsets=np.concatenate([[0], np.cumsum(counts)]),

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError, TableError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
+from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 from rayfix_tables.schema import (
     FORMAT,
@@ -28,41 +29,6 @@ from rayfix_tables.schema import (
     level_path,
 )
 from rayfix_tables.site import SiteInfo, Station
-
-
-@dataclass(frozen=True, kw_only=True)
-class Level:
-    """All cells of one station at one window; the arrays are views of the mapped file.
-
-    Attributes
-    ----------
-    window : float, rad
-        Standard deviation of the cells' Gaussian window, along either tangent axis.
-    cell_offsets : ndarray of int64, shape (n_cells + 1,)
-    cell_log_mass : ndarray of shape (n_cells,)
-    mixture : TubeMixture
-        Components of all cells.
-    """
-
-    window: float
-    grid: AngularGrid
-    cell_offsets: NDArray[np.int64]
-    cell_log_mass: NDArray[np.float64]
-    mixture: TubeMixture
-
-    @property
-    def num_cells(self) -> int:
-        """Number of cells of the grid."""
-        return self.grid.num_cells
-
-    @property
-    def num_components(self) -> int:
-        """Number of components over all cells."""
-        return len(self.mixture)
-
-    def cell(self, index: int) -> TubeMixture:
-        """Components of one cell."""
-        return self.mixture[int(self.cell_offsets[index]) : int(self.cell_offsets[index + 1])]
 
 
 @dataclass(frozen=True, kw_only=True)

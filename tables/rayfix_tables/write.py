@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from rayfix_tables.errors import TableError
 from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.grid import AngularGrid
-from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+from rayfix_tables.level import Level
+from rayfix_tables.mixture import FIELD_SHAPES
 from rayfix_tables.schema import (
     FORMAT,
     FORMAT_VERSION,
@@ -27,35 +27,6 @@ from rayfix_tables.schema import (
     level_path,
 )
 from rayfix_tables.site import SiteInfo
-
-
-@dataclass(frozen=True, kw_only=True)
-class LevelContent:
-    """All cells of one station at one window.
-
-    Attributes
-    ----------
-    window : float, rad
-        Standard deviation of the cells' Gaussian window, along either tangent axis.
-    cell_offsets : ndarray of int64, shape (n_cells + 1,)
-        Components of cell ``c`` are those from ``cell_offsets[c]`` to ``cell_offsets[c + 1]``.
-    cell_log_mass : ndarray of shape (n_cells,)
-        Natural logarithm of the integral of the cell's measure; -inf for a cell without components.
-    mixture : TubeMixture
-        Components of all cells.
-    """
-
-    window: float
-    grid: AngularGrid
-    cell_offsets: NDArray[np.int64]
-    cell_log_mass: NDArray[np.float64]
-    mixture: TubeMixture
-
-    @property
-    def num_bytes(self) -> int:
-        """Size of the level's arrays in the file."""
-        arrays = [getattr(self.mixture, name) for name in FIELD_SHAPES]
-        return sum(a.nbytes for a in (self.grid.ring_cells, self.cell_offsets, self.cell_log_mass, *arrays))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +43,7 @@ class StationContent:
         Names all that decided the part's content, so that a later build can tell whether it is still right.
     """
 
-    levels: tuple[LevelContent, ...]
+    levels: tuple[Level, ...]
     lost_ray_share: float
     coverage: tuple[float, ...]
     part_id: str = ""
@@ -236,7 +207,7 @@ def _write_scene(file: h5py.File, scene: SceneContent) -> None:
     free_space.attrs["voxel_size_m"] = scene.free_space.voxel_size
 
 
-def _write_level(group: h5py.Group, level: LevelContent) -> None:
+def _write_level(group: h5py.Group, level: Level) -> None:
     group.attrs["window_deg"] = float(np.rad2deg(level.window))
     _write(group, "ring_cells", level.grid.ring_cells.astype(np.int64))
     _write(group, "cell_offsets", level.cell_offsets.astype(np.int64))

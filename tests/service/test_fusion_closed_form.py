@@ -36,10 +36,11 @@ from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.angles import angles_of, direction
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
+from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture, pack
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table
-from rayfix_tables.write import LevelContent, SceneContent, StationContent, write_table
+from rayfix_tables.write import SceneContent, StationContent, write_table
 
 Array = NDArray[np.float64]
 
@@ -115,7 +116,7 @@ def station_content(tubes: list[Tube]) -> StationContent:
             x_cov=pack(np.array([tube.x_cov for tube in tubes])),
             num_reflections=np.zeros(len(tubes), np.int8),
         )
-    level = LevelContent(window=WINDOW, grid=GRID, cell_offsets=offsets, cell_log_mass=masses, mixture=mixture)
+    level = Level(window=WINDOW, grid=GRID, cell_offsets=offsets, cell_log_mass=masses, mixture=mixture)
     return StationContent(levels=(level,), lost_ray_share=0.0, coverage=(1.0,))
 
 

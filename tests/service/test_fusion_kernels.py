@@ -16,9 +16,10 @@ from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
+from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture, pack, unpack
 from rayfix_tables.site import Station
-from rayfix_tables.table import Level, StationPart
+from rayfix_tables.table import StationPart
 
 Array = NDArray[np.float64]
 Times = tuple[NDArray[np.int64], Array, Array]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from rayfix_service.fusion.lookup import NO_DIRECTION, WINDOW_RATIO, Direction, Lookup, look_up
 from rayfix_tables.angles import wrap
 from rayfix_tables.grid import AngularGrid
+from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture
-from rayfix_tables.table import Level
 
 Array = NDArray[np.float64]
 

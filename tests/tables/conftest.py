@@ -9,9 +9,10 @@ import pytest
 
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
+from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 from rayfix_tables.site import SiteInfo, Station
-from rayfix_tables.write import LevelContent, SceneContent, StationContent, write_table
+from rayfix_tables.write import SceneContent, StationContent, write_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +57,7 @@ def random_content(
             grid = AngularGrid.from_spacing(window / 0.8)
             counts = rng.integers(0, max_components + 1, grid.num_cells)
             levels.append(
-                LevelContent(
+                Level(
                     window=float(window),
                     grid=grid,
                     cell_offsets=np.concatenate([[0], np.cumsum(counts)]),

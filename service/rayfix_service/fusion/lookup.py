@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.angles import wrap
-from rayfix_tables.table import Level
+from rayfix_tables.level import Level
 
 WINDOW_RATIO = 1.25
 """A window's standard deviation is at least this times that of a measurement it serves."""

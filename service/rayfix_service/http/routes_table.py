@@ -8,8 +8,8 @@ from pydantic import BaseModel, Field
 from rayfix_service.http.dependencies import LocatorDep
 from rayfix_service.http.problems import NOT_READY, problem_responses
 from rayfix_service.wire import Point
+from rayfix_tables.level import Level
 from rayfix_tables.site import Station
-from rayfix_tables.table import Level
 
 router = APIRouter(prefix="/v1", tags=["table"])
 

@@ -1,0 +1,52 @@
+"""A level: all cells of one station at one window."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_tables.grid import AngularGrid
+from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """All cells of one station at one window; from a table, the arrays are views of the mapped file.
+
+    Attributes
+    ----------
+    window : float, rad
+        Standard deviation of the cells' Gaussian window, along either tangent axis.
+    cell_offsets : ndarray of int64, shape (n_cells + 1,)
+        Components of cell ``c`` are those from ``cell_offsets[c]`` to ``cell_offsets[c + 1]``.
+    cell_log_mass : ndarray of shape (n_cells,)
+        Natural logarithm of the integral of the cell's measure; -inf for a cell without components.
+    mixture : TubeMixture
+        Components of all cells.
+    """
+
+    window: float
+    grid: AngularGrid
+    cell_offsets: NDArray[np.int64]
+    cell_log_mass: NDArray[np.float64]
+    mixture: TubeMixture
+
+    @property
+    def num_cells(self) -> int:
+        """Number of cells of the grid."""
+        return self.grid.num_cells
+
+    @property
+    def num_components(self) -> int:
+        """Number of components over all cells."""
+        return len(self.mixture)
+
+    def cell(self, index: int) -> TubeMixture:
+        """Components of one cell."""
+        return self.mixture[int(self.cell_offsets[index]) : int(self.cell_offsets[index + 1])]
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of the level's arrays in the file."""
+        arrays = [getattr(self.mixture, name) for name in FIELD_SHAPES]
+        return sum(a.nbytes for a in (self.grid.ring_cells, self.cell_offsets, self.cell_log_mass, *arrays))
