@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types package openapi accuracy clean
+.PHONY: demo test lint types package accuracy clean
 
 # The environment is made anew when what it holds has changed.
 $(VENV)/.done: pyproject.toml constraints.txt
