@@ -6,6 +6,7 @@ hit comes from one division, however many reflections went before, and nothing a
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ class RaySet:
     zenith: NDArray[np.float64]
     solid_angle: NDArray[np.float64]
 
-    @property
+    @cached_property
     def directions(self) -> NDArray[np.float64]:
         """Unit vectors, shape (n_rays, 3)."""
         return direction(self.azimuth, self.zenith)

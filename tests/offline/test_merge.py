@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_offline.merge import log_det, merge_runnalls, merged_cov
+from rayfix_offline.merge import LANES, merge_runnalls, new_scratch, union_log_dets
 
 Array = NDArray[np.float64]
 Mixture = tuple[Array, Array, Array]
@@ -74,21 +74,37 @@ def sort(mixture: Mixture, label: list[int]) -> tuple[Mixture, list[int]]:
     return tuple(field[order] for field in mixture), [label[k] for k in order]  # type: ignore[return-value]
 
 
-@settings(deadline=None)
-@given(seeds, st.integers(1, 7))
-def test_log_det(seed: int, size: int) -> None:
-    (cov,) = random_mixture(seed, 1, size)[2]
-    assert log_det(cov, np.empty((size, size))) == pytest.approx(np.linalg.slogdet(cov)[1], abs=1e-10)
+def log_dets(mixture: Mixture, i: int, first: int, stop: int) -> Array:
+    """Run the kernel; NaN where it must not write."""
+    weight, mean, cov = mixture
+    size = mean.shape[1]
+    triangles = np.ascontiguousarray(cov[:, *np.tril_indices(size)].T)
+    out = np.full(len(weight), np.nan)
+    union_log_dets(i, first, stop, weight, np.ascontiguousarray(mean.T), triangles, new_scratch(size), out)
+    return out
 
 
 @settings(deadline=None)
-@given(seeds)
-def test_merged_covariance(seed: int) -> None:
-    weight, mean, cov = random_mixture(seed, 2)
-    union = np.empty((3, 3))
-    merged_cov(weight[0], mean[0], cov[0], weight[1], mean[1], cov[1], union)
-    np.testing.assert_allclose(union, moments(weight, mean, cov)[2], rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(union, union.T)
+@given(seeds, st.integers(1, 7), st.integers(1, 9))
+def test_determinants_of_unions(seed: int, size: int, count: int) -> None:
+    weight, mean, cov = mixture = random_mixture(seed, count, size)
+    i = seed % count
+    unions = [moments(weight[[i, k]], mean[[i, k]], cov[[i, k]])[2] for k in range(count)]
+    found = log_dets(mixture, i, 0, count)
+    np.testing.assert_allclose(found, np.linalg.slogdet(np.array(unions))[1], rtol=0, atol=1e-10)
+    assert found[i] == pytest.approx(np.linalg.slogdet(cov[i])[1], abs=1e-10)
+
+
+def test_determinants_of_more_unions_than_lanes() -> None:
+    """Any part of the components gives the same numbers, and nothing beside it is written."""
+    count = 2 * LANES + 3
+    mixture = random_mixture(5, count, 6)
+    whole = log_dets(mixture, 7, 0, count)
+    assert np.all(np.isfinite(whole))
+    for first, stop in ((0, 1), (1, LANES + 2), (LANES - 1, count), (count, count)):
+        part = log_dets(mixture, 7, first, stop)
+        np.testing.assert_array_equal(part[first:stop], whole[first:stop])
+        assert np.isnan(np.delete(part, np.s_[first:stop])).all()
 
 
 @settings(max_examples=40, deadline=None)
