@@ -45,7 +45,8 @@ def gather_groups(
     piece_variance: Any,
     images: Any,
     mirrors: Any,
-    slots: Any,
+    num_slices: Any,
+    rows: Any,
 ) -> Any:
     """Add up the weighted moments of one cell.
 
@@ -56,12 +57,15 @@ def gather_groups(
     ----------
     window : float, rad
         Standard deviation of the cell's window.
-    slots : ndarray of int32, shape (n_sequences, n_slices)
+    num_slices : int
+        Slices are numbered below this.
+    rows : ndarray of int32, shape (n_sequences,)
         Scratch, all -1; left so.
 
     Returns
     -------
     sequence : ndarray of int64, shape (n_groups,)
+    slice : ndarray of int64, shape (n_groups,)
     mass : ndarray of shape (n_groups,)
     mean : ndarray of shape (n_groups, 6)
     cov : ndarray of shape (n_groups, 6, 6)
@@ -69,6 +73,9 @@ def gather_groups(
     keys = np.empty((64, 2), np.int64)
     sums = np.zeros((64, NUM_SUMS))
     count = 0
+    # Groups by slice, for the sequences that the cell has: all of a station's would be too many to keep a place for.
+    slots = np.full((16, num_slices), -1, np.int32)
+    num_rows = 0
     sine = np.sin(centre_zenith)
     reach = CUTOFF * window
     num_rings = len(ring_cells)
@@ -96,6 +103,12 @@ def gather_groups(
             if count + last - first > len(sums):
                 capacity = 2 * (count + last - first)
                 keys, sums = _grown(keys, capacity), _grown(sums, capacity)
+            for piece in range(first, last):
+                if rows[piece_sequence[piece]] < 0 and density * piece_mass[piece] > 0.0:
+                    rows[piece_sequence[piece]] = num_rows
+                    num_rows += 1
+            while num_rows > len(slots):
+                slots = np.concatenate((slots, np.full_like(slots, -1)))
             count = _add_ray(
                 density,
                 horizontal,
@@ -106,6 +119,7 @@ def gather_groups(
                 piece_mass[first:last],
                 piece_mean[first:last],
                 piece_variance[first:last],
+                rows,
                 slots,
                 keys,
                 sums,
@@ -116,10 +130,10 @@ def gather_groups(
     means = np.empty((count, SIZE))
     covs = np.empty((count, SIZE, SIZE))
     for group in range(count):
-        slots[keys[group, 0], keys[group, 1]] = -1
+        rows[keys[group, 0]] = -1
         masses[group] = sums[group, 0]
         _to_moments(sums[group], images[keys[group, 0]], mirrors[keys[group, 0]], means[group], covs[group])
-    return keys[:count, 0], masses, means, covs
+    return keys[:count, 0], keys[:count, 1], masses, means, covs
 
 
 @numba.njit(cache=True, nogil=True)
@@ -133,6 +147,7 @@ def _add_ray(
     piece_mass: Any,
     piece_mean: Any,
     piece_variance: Any,
+    rows: Any,
     slots: Any,
     keys: Any,
     sums: Any,
@@ -148,11 +163,12 @@ def _add_ray(
         mass = density * piece_mass[piece]
         if mass <= 0.0:
             continue
-        group = slots[sequence[piece], slices[piece]]
+        row = rows[sequence[piece]]
+        group = slots[row, slices[piece]]
         if group < 0:
             group = count
             count += 1
-            slots[sequence[piece], slices[piece]] = group
+            slots[row, slices[piece]] = group
             keys[group, 0] = sequence[piece]
             keys[group, 1] = slices[piece]
         once = mass * piece_mean[piece]
@@ -300,6 +316,6 @@ def _grown(
     return larger
 
 
-def new_slots(num_sequences: int, num_slices: int) -> NDArray[np.int32]:
+def new_rows(num_sequences: int) -> NDArray[np.int32]:
     """Scratch for :func:`gather_groups`."""
-    return np.full((num_sequences, num_slices), -1, np.int32)
+    return np.full(num_sequences, -1, np.int32)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline import moments, trace
+from rayfix_offline import moments, surfaces, trace
 from rayfix_offline.em import ExpectationMaximisation
 from rayfix_offline.shards import content_key
 from rayfix_offline.site import SiteFile, StationSection
@@ -74,7 +74,7 @@ def plan_build(site: SiteFile, twin: Twin) -> tuple[StationPlan, ...]:
     common = content_key(
         BUILD_VERSION,
         FORMAT_VERSION,
-        _method_settings(site),
+        _method_settings(site, curved=twin.planes.curved),
         twin.scene.sha256,
         hashlib.sha256(np.packbits(twin.free_space.free).tobytes()).hexdigest(),
         [*twin.free_space.origin.tolist(), twin.free_space.voxel_size, *twin.free_space.free.shape],
@@ -92,11 +92,11 @@ def plan_build(site: SiteFile, twin: Twin) -> tuple[StationPlan, ...]:
     )
 
 
-def _method_settings(site: SiteFile) -> dict[str, float | dict[str, float]]:
+def _method_settings(site: SiteFile, *, curved: bool) -> dict[str, float | dict[str, float]]:
     fit = TubeFit() if site.table.fit == "tubes" else ExpectationMaximisation(seed=site.table.seed)
     constants = {
         f"{module.__name__}.{name}": value
-        for module in (moments, trace)
+        for module in ((moments, trace, surfaces) if curved else (moments, trace))
         for name, value in vars(module).items()
         if name.isupper() and isinstance(value, int | float)
     }

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+
+from rayfix_offline.topology import connect
 
 TOLERANCE = 1e-3
 """Triangles whose planes differ by less than this over the whole scene are coplanar, m."""
@@ -26,11 +26,19 @@ class Planes:
     offsets : ndarray of shape (n_planes,), m
     face_planes : ndarray of int32, shape (n_faces,)
         Plane of each triangle.
+    surfaces : ndarray of int32, shape (n_planes,)
+        Surface that each plane belongs to: the facets of a curved one have it in common.
     """
 
     normals: NDArray[np.float64]
     offsets: NDArray[np.float64]
     face_planes: NDArray[np.int32]
+    surfaces: NDArray[np.int32]
+
+    @property
+    def curved(self) -> bool:
+        """Whether planes have a surface in common."""
+        return len(self.surfaces) > 0 and int(self.surfaces.max()) + 1 < len(self)
 
     def __len__(self) -> int:
         """Return the number of planes."""
@@ -38,7 +46,7 @@ class Planes:
 
 
 def merge_coplanar(triangles: NDArray[np.float64], *, tolerance: float = TOLERANCE) -> Planes:
-    """Find the planes of triangles; triangles of one plane need not touch.
+    """Find the planes of triangles; triangles of one plane need not touch, and each plane is a surface by itself.
 
     Parameters
     ----------
@@ -63,8 +71,7 @@ def merge_coplanar(triangles: NDArray[np.float64], *, tolerance: float = TOLERAN
     pairs = cKDTree(rounded * step).query_pairs(tolerance, output_type="ndarray")
     count = len(triangles)
     links = np.concatenate([pairs, np.stack([inverse[:count], inverse[count:]], axis=1)])
-    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(len(rounded), len(rounded)))
-    _, labels = connected_components(graph, directed=False)
+    labels = connect(links, len(rounded))
     _, first, face_planes = np.unique(labels[inverse[:count]], return_index=True, return_inverse=True)
 
     # The mean over the plane's area: all rays of one reflection sequence then share one exact mirror image.
@@ -79,4 +86,5 @@ def merge_coplanar(triangles: NDArray[np.float64], *, tolerance: float = TOLERAN
         normals=plane_normals,
         offsets=np.einsum("ij,ij->i", plane_normals, middle),
         face_planes=face_planes.astype(np.int32),
+        surfaces=np.arange(len(first), dtype=np.int32),
     )

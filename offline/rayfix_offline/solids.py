@@ -7,11 +7,10 @@ from typing import Any
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from trimesh.triangles import closest_point
 
 from rayfix_offline.scene import Scene
+from rayfix_offline.topology import Topology
 from rayfix_tables.freespace import FreeSpace
 
 MAX_VOXELS = 20_000_000
@@ -20,7 +19,6 @@ MAX_VOXELS = 20_000_000
 TOUCH = 1e-3
 """Whatever is nearer to a surface lies on it, m."""
 
-_WELD = 1e-6
 _ENCLOSURE_SHARE = 0.05
 
 
@@ -49,36 +47,36 @@ class Part:
     volume: float
 
 
-def split_parts(scene: Scene) -> tuple[Part, ...]:
-    """Cut the scene into connected parts; vertices less than a micrometre apart count as one."""
-    _, welded = np.unique(np.round(scene.vertices / _WELD), axis=0, return_inverse=True)
-    faces = welded.reshape(-1)[scene.faces]
-    links = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    count = int(faces.max()) + 1
-    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
-    of_face = label[faces[:, 0]]
-    order = np.argsort(of_face, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(of_face[order])) + 1)
-    return tuple(_part(scene, faces, group) for group in groups)
+def split_parts(scene: Scene, topology: Topology) -> tuple[Part, ...]:
+    """Cut the scene into connected parts."""
+    label = topology.components()
+    count = int(label.max()) + 1
+    order = np.argsort(label, kind="stable")
+    sizes = np.bincount(label, minlength=count)
+    offsets = np.concatenate([[0], np.cumsum(sizes)])
 
+    def all_of(condition: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return np.asarray(np.bincount(label, weights=~condition, minlength=count) == 0)
 
-def _part(scene: Scene, welded_faces: NDArray[np.int64], chosen: NDArray[np.int64]) -> Part:
-    faces = welded_faces[chosen]
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    forward = edges[:, 0] < edges[:, 1]
-    _, inverse, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    balance = np.bincount(inverse.reshape(-1), weights=np.where(forward, 1.0, -1.0))
-    corners = scene.triangles[chosen]
-    middle = corners.reshape(-1, 3).mean(axis=0)
-    a, b, c = (corners[:, i] - middle for i in range(3))
-    names = np.bincount(scene.face_objects[chosen])
-    return Part(
-        name=scene.objects[int(names.argmax())],
-        faces=chosen,
-        closed=bool(np.all(uses % 2 == 0)),
-        consistent=bool(np.all(balance == 0)),
-        volume=float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0),
+    closed = all_of((topology.edge_uses % 2 == 0)[topology.edges].all(axis=1))
+    consistent = all_of((topology.edge_balance == 0)[topology.edges].all(axis=1))
+    # About the part's own middle: far from the origin, the triangles' shares would cancel.
+    middle = np.stack([np.bincount(label, weights=m) for m in scene.triangles.mean(axis=1).T], axis=1) / sizes[:, None]
+    a, b, c = (scene.triangles[:, i] - middle[label] for i in range(3))
+    volume = np.bincount(label, weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0, minlength=count)
+    # The object that most triangles of the part belong to.
+    pairs, uses = np.unique(label * len(scene.objects) + scene.face_objects, return_counts=True)
+    best = pairs[np.lexsort((-uses, pairs // len(scene.objects)))]
+    names = best[np.unique(best // len(scene.objects), return_index=True)[1]] % len(scene.objects)
+    return tuple(
+        Part(
+            name=scene.objects[names[part]],
+            faces=order[offsets[part] : offsets[part + 1]],
+            closed=bool(closed[part]),
+            consistent=bool(consistent[part]),
+            volume=float(volume[part]),
+        )
+        for part in range(count)
     )
 
 

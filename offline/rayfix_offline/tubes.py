@@ -7,8 +7,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_offline.joining import join_groups
 from rayfix_offline.merge import merge_runnalls
-from rayfix_offline.moments import blur, gather_groups, new_slots
+from rayfix_offline.moments import blur, gather_groups, new_rows
 from rayfix_offline.trace import LevelRays
 from rayfix_tables.mixture import TubeMixture, pack
 
@@ -72,12 +73,15 @@ def fit_tubes(
         pieces.variance,
         sequences.images,
         sequences.mirrors,
+        sequences.surface_sequences.astype(np.int64),
+        bool(np.any(sequences.surface_sequences != np.arange(len(sequences.images)))),
+        pieces.num_slices,
         level.ray_spacing,
         fit.dropped_mass,
         fit.max_groups,
         fit.max_components,
         fit.max_divergence,
-        new_slots(len(sequences.images), pieces.num_slices),
+        new_rows(len(sequences.images)),
     )
     return counts, log_mass, joint_to_tubes(log_weight, mean, cov, sequences.num_reflections[label])
 
@@ -127,12 +131,15 @@ def _fit_block(
     piece_variance: Any,
     images: Any,
     mirrors: Any,
+    surface_sequences: Any,
+    curved: Any,
+    num_slices: Any,
     ray_spacing: Any,
     dropped_mass: Any,
     max_groups: Any,
     max_components: Any,
     max_divergence: Any,
-    slots: Any,
+    rows: Any,
 ) -> Any:
     num_cells = len(centres)
     counts = np.zeros(num_cells, np.int64)
@@ -143,7 +150,7 @@ def _fit_block(
     label = np.empty(num_cells * max_components, np.int64)
     total = 0
     for cell in range(num_cells):
-        seq, mass, group_mean, group_cov = gather_groups(
+        seq, slices, mass, group_mean, group_cov = gather_groups(
             centres[cell, 0],
             centres[cell, 1],
             window,
@@ -161,8 +168,14 @@ def _fit_block(
             piece_variance,
             images,
             mirrors,
-            slots,
+            num_slices,
+            rows,
         )
+        group_mirror = mirrors[seq]
+        if curved:
+            seq, mass, group_mean, group_cov, group_mirror = join_groups(
+                surface_sequences[seq], slices, mass, group_mean, group_cov, group_mirror
+            )
         whole = mass.sum()
         if whole <= 0.0:
             continue
@@ -177,11 +190,12 @@ def _fit_block(
         part_mean = group_mean[chosen]
         part_cov = group_cov[chosen]
         part_label = seq[chosen]
+        part_mirror = group_mirror[chosen]
         for i in range(kept):
             blur(
                 part_mean[i],
                 part_cov[i],
-                mirrors[part_label[i]],
+                part_mirror[i],
                 centres[cell, 0],
                 centres[cell, 1],
                 ray_spacing,

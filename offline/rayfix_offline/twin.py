@@ -13,6 +13,8 @@ from rayfix_offline.planes import Planes, merge_coplanar
 from rayfix_offline.scene import Scene, load_scene
 from rayfix_offline.site import SiteFile
 from rayfix_offline.solids import Part, find_enclosures, map_free_space, split_parts, touched
+from rayfix_offline.surfaces import join_facets
+from rayfix_offline.topology import find_topology
 from rayfix_tables.errors import SceneError
 from rayfix_tables.freespace import FreeSpace
 
@@ -69,7 +71,8 @@ def prepare_twin(site: SiteFile, folder: Path) -> Twin:
 
 def prepare_scene(site: SiteFile, scene: Scene) -> Twin:
     """Check a scene that is loaded already; see :func:`prepare_twin`."""
-    parts = split_parts(scene)
+    topology = find_topology(scene)
+    parts = split_parts(scene, topology)
     stations = np.array([station.position_m for station in site.stations])
     enclosing, inside = find_enclosures(scene, parts, stations)
     free_space = map_free_space(scene, parts, enclosing, voxel_size=VOXEL_SIZE)
@@ -83,7 +86,7 @@ def prepare_scene(site: SiteFile, scene: Scene) -> Twin:
         findings.append(Finding(severity="error", message=message))
     return Twin(
         scene=scene,
-        planes=merge_coplanar(scene.triangles),
+        planes=join_facets(scene.triangles, merge_coplanar(scene.triangles), topology),
         engine=EmbreeEngine(scene.triangles),
         free_space=free_space,
         closed=bool(enclosing.any()),

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rayfix_offline.launch import RaySet, Segments, Sequences, sample_rays
-from rayfix_offline.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR, blur, gather_groups, new_slots
+from rayfix_offline.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR, blur, gather_groups, new_rows
 from rayfix_offline.pathprior import PathPrior
 from rayfix_offline.pieces import Pieces, cut_pieces
 from rayfix_tables.angles import direction, tangent
@@ -38,12 +38,10 @@ def traced(clutter: NDArray[np.float64], launch_in: Launch) -> Traced:
     return Traced(rays, pieces, segments.sequences)
 
 
-def gather(
-    traced: Traced, centre: tuple[float, float], window: float, slots: NDArray[np.int32] | None = None
-) -> Groups:
-    """Run the kernel; groups by sequence and their place in the answer, which does not tell the slice."""
+def gather(traced: Traced, centre: tuple[float, float], window: float, rows: NDArray[np.int32] | None = None) -> Groups:
+    """Run the kernel; groups by sequence and slice."""
     rays, pieces = traced.rays, traced.pieces
-    sequence, mass, mean, cov = gather_groups(
+    sequence, slices, mass, mean, cov = gather_groups(
         *centre,
         window,
         rays.grid.ring_offsets,
@@ -60,9 +58,11 @@ def gather(
         pieces.variance,
         traced.sequences.images,
         traced.sequences.mirrors,
-        new_slots(len(traced.sequences.images), pieces.num_slices) if slots is None else slots,
+        pieces.num_slices,
+        new_rows(len(traced.sequences.images)) if rows is None else rows,
     )
-    return {(int(s), n): (m, u, c) for n, (s, m, u, c) in enumerate(zip(sequence, mass, mean, cov, strict=True))}
+    found = zip(sequence, slices, mass, mean, cov, strict=True)
+    return {(int(s), int(n)): (m, u, c) for s, n, m, u, c in found}
 
 
 def naive_groups(traced: Traced, centre: tuple[float, float], window: float) -> Groups:
@@ -106,24 +106,21 @@ CENTRES = [
 def test_gathered_groups(traced: Traced, centre: tuple[float, float], window: float) -> None:
     found, expected = gather(traced, centre, window), naive_groups(traced, centre, window)
     assert len(found) == len(expected) > 2
-    left = dict(expected)
-    for (sequence, _), (mass, mean, cov) in found.items():
-        # Means of one sequence differ by the slice; the nearest one is meant.
-        key = min((k for k in left if k[0] == sequence), key=lambda k: np.abs(left[k][1] - mean).sum())
-        its_mass, its_mean, its_cov = left.pop(key)
+    assert found.keys() == expected.keys()
+    for key, (mass, mean, cov) in found.items():
+        its_mass, its_mean, its_cov = expected[key]
         assert mass == pytest.approx(its_mass, rel=1e-11)
         np.testing.assert_allclose(mean, its_mean, rtol=0, atol=1e-11)
         np.testing.assert_allclose(cov, its_cov, rtol=0, atol=1e-11)
         np.testing.assert_array_equal(cov, cov.T)
-    assert not left
 
 
 def test_the_scratch_is_left_clean(traced: Traced) -> None:
-    slots = new_slots(len(traced.sequences.images), traced.pieces.num_slices)
-    first = gather(traced, CENTRES[0], 0.2, slots)
-    np.testing.assert_array_equal(slots, -1)
-    gather(traced, CENTRES[1], 0.2, slots)
-    again = gather(traced, CENTRES[0], 0.2, slots)
+    rows = new_rows(len(traced.sequences.images))
+    first = gather(traced, CENTRES[0], 0.2, rows)
+    np.testing.assert_array_equal(rows, -1)
+    gather(traced, CENTRES[1], 0.2, rows)
+    again = gather(traced, CENTRES[0], 0.2, rows)
     assert first.keys() == again.keys()
     for key, (mass, mean, cov) in first.items():
         assert again[key][0] == mass
@@ -162,6 +159,7 @@ def test_the_mass_is_the_integral_of_the_window(window: float) -> None:
         parents=np.array([-1], np.int32),
         planes=np.array([-1], np.int32),
         num_reflections=np.zeros(1, np.int8),
+        surface_sequences=np.zeros(1, np.int32),
     )
     centre = (0.4, 1.2)
     ((mass, mean, cov),) = gather(Traced(rays, pieces, sequences), centre, window).values()

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from rayfix_offline import solids
 from rayfix_offline.scene import Scene
-from rayfix_offline.solids import find_enclosures, is_inside, map_free_space, split_parts, touched
+from rayfix_offline.solids import Part, find_enclosures, is_inside, map_free_space, split_parts, touched
+from rayfix_offline.topology import find_topology
 
 Box = Callable[..., NDArray[np.float64]]
 seeds = st.integers(0, 2**32 - 1)
@@ -32,6 +33,11 @@ def scene_of(**objects: NDArray[np.float64]) -> Scene:
     )
 
 
+def parts_of(scene: Scene) -> tuple[Part, ...]:
+    """Split a scene."""
+    return split_parts(scene, find_topology(scene))
+
+
 def moved(triangles: NDArray[np.float64], rotation: Rotation, shift: NDArray[np.float64]) -> NDArray[np.float64]:
     """Turn triangles about the origin, then shift them."""
     return np.asarray(rotation.apply(triangles.reshape(-1, 3)).reshape(-1, 3, 3) + shift)
@@ -42,7 +48,7 @@ def moved(triangles: NDArray[np.float64], rotation: Rotation, shift: NDArray[np.
 
 def test_parts_of_a_room(clutter: NDArray[np.float64]) -> None:
     scene = scene_of(room=clutter[:12, ::-1], cabinet=clutter[12:24], table=clutter[24:])
-    room, cabinet, table = split_parts(scene)
+    room, cabinet, table = parts_of(scene)
     assert [part.name for part in (room, cabinet, table)] == ["room", "cabinet", "table"]
     np.testing.assert_array_equal(cabinet.faces, np.arange(12, 24))
     assert all(part.closed and part.consistent for part in (room, cabinet, table))
@@ -57,13 +63,13 @@ def test_volume_does_not_depend_on_the_place(box: Box, seed: int) -> None:
     rng = np.random.default_rng(seed)
     size = rng.uniform(0.1, 3.0, 3)
     triangles = moved(box(-size / 2, size / 2), Rotation.random(rng=rng), rng.uniform(-1e3, 1e3, 3))
-    (part,) = split_parts(scene_of(thing=triangles))
+    (part,) = parts_of(scene_of(thing=triangles))
     assert part.closed
     assert part.volume == pytest.approx(np.prod(size), rel=1e-9)
 
 
 def test_a_missing_triangle_opens_a_part(box: Box) -> None:
-    (part,) = split_parts(scene_of(crate=box((0, 0, 0), (1, 1, 1))[1:]))
+    (part,) = parts_of(scene_of(crate=box((0, 0, 0), (1, 1, 1))[1:]))
     assert not part.closed
     assert not part.consistent
 
@@ -71,13 +77,13 @@ def test_a_missing_triangle_opens_a_part(box: Box) -> None:
 def test_one_turned_triangle(box: Box) -> None:
     triangles = box((0, 0, 0), (1, 1, 1))
     triangles[4] = triangles[4, ::-1]
-    (part,) = split_parts(scene_of(crate=triangles))
+    (part,) = parts_of(scene_of(crate=triangles))
     assert (part.closed, part.consistent) == (True, False)
 
 
 def test_boxes_that_touch_along_an_edge_are_one_closed_part(box: Box) -> None:
     """Four triangles meet at the common edge."""
-    (part,) = split_parts(scene_of(a=box((0, 0, 0), (1, 1, 1)), b=box((1, 1, 0), (3, 2, 1))))
+    (part,) = parts_of(scene_of(a=box((0, 0, 0), (1, 1, 1)), b=box((1, 1, 0), (3, 2, 1))))
     assert (part.closed, part.consistent) == (True, True)
     assert part.volume == pytest.approx(3.0, rel=1e-12)
 
@@ -88,18 +94,18 @@ def test_a_partition_of_one_sheet_opens_a_part(box: Box) -> None:
     sheet = np.all(walls[:, :, 2] == 1.0, axis=1)
     twice, once = walls, np.delete(walls, np.flatnonzero(sheet)[:2], axis=0)
     assert np.count_nonzero(sheet) == 4
-    assert split_parts(scene_of(crate=twice))[0].closed
-    assert not split_parts(scene_of(crate=once))[0].closed
+    assert parts_of(scene_of(crate=twice))[0].closed
+    assert not parts_of(scene_of(crate=once))[0].closed
 
 
 def test_a_seam_below_a_micrometre_is_none(box: Box) -> None:
     triangles = box((0, 0, 0), (1, 1, 1))
-    (part,) = split_parts(scene_of(crate=triangles + np.random.default_rng(0).uniform(-1e-9, 1e-9, triangles.shape)))
+    (part,) = parts_of(scene_of(crate=triangles + np.random.default_rng(0).uniform(-1e-9, 1e-9, triangles.shape)))
     assert part.closed
 
 
 def test_a_sheet_is_open() -> None:
-    (part,) = split_parts(scene_of(sheet=np.array([[(0, 0, 0), (1, 0, 0), (0, 1, 0)]], dtype=float)))
+    (part,) = parts_of(scene_of(sheet=np.array([[(0, 0, 0), (1, 0, 0), (0, 1, 0)]], dtype=float)))
     assert (part.closed, part.consistent, part.name) == (False, False, "sheet")
 
 
@@ -184,7 +190,7 @@ def test_touching_a_box(box: Box, seed: int) -> None:
 
 def enclosures(scene: Scene, *stations: tuple[float, float, float]) -> tuple[dict[str, bool], dict[str, list[bool]]]:
     """Give which named parts enclose, and which stations are in which parts."""
-    parts = split_parts(scene)
+    parts = parts_of(scene)
     enclosing, inside = find_enclosures(scene, parts, np.array(stations))
     names = [part.name for part in parts]
     return dict(zip(names, enclosing.tolist(), strict=True)), dict(zip(names, inside.tolist(), strict=True))
@@ -236,7 +242,7 @@ def free_space(
     scene: Scene, *, enclosing: list[bool], voxel_size: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Give the map and its voxels' centres."""
-    space = map_free_space(scene, split_parts(scene), np.array(enclosing), voxel_size=voxel_size)
+    space = map_free_space(scene, parts_of(scene), np.array(enclosing), voxel_size=voxel_size)
     index = np.stack(np.meshgrid(*(np.arange(n) for n in space.free.shape), indexing="ij"), axis=-1)
     return space.free, space.origin + (index + 0.5) * space.voxel_size
 
@@ -308,7 +314,7 @@ def test_an_open_part_is_not_solid(clutter: NDArray[np.float64]) -> None:
 def test_a_large_scene_gets_larger_voxels(box: Box, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solids, "MAX_VOXELS", 10_000)
     scene = scene_of(hall=box((0, 0, 0), (80, 180, 25)))
-    space = map_free_space(scene, split_parts(scene), np.array([True]), voxel_size=0.1)
+    space = map_free_space(scene, parts_of(scene), np.array([True]), voxel_size=0.1)
     assert space.free.size <= 10_000 * 1.5  # every axis is rounded up
     assert space.voxel_size == pytest.approx((80 * 180 * 25 / 10_000) ** (1 / 3), rel=1e-12)
     # Voxels that reach beyond the hall count where their centre lies within.
@@ -317,13 +323,13 @@ def test_a_large_scene_gets_larger_voxels(box: Box, monkeypatch: pytest.MonkeyPa
 
 def test_a_flat_scene_has_a_layer_of_voxels() -> None:
     scene = scene_of(floor=np.array([[(0, 0, 0), (1, 0, 0), (1, 1, 0)]], dtype=float))
-    assert map_free_space(scene, split_parts(scene), np.array([False]), voxel_size=0.1).free.shape == (10, 10, 1)
+    assert map_free_space(scene, parts_of(scene), np.array([False]), voxel_size=0.1).free.shape == (10, 10, 1)
 
 
 def test_vertices_that_are_shared_or_not_make_no_difference(room: NDArray[np.float64]) -> None:
     soup = scene_of(room=room)
     vertices, index = np.unique(soup.vertices, axis=0, return_inverse=True)
     shared = replace(soup, vertices=vertices, faces=index.reshape(-1, 3).astype(np.int32))
-    (one,), (other,) = split_parts(soup), split_parts(shared)
+    (one,), (other,) = parts_of(soup), parts_of(shared)
     assert (one.closed, one.consistent) == (other.closed, other.consistent) == (True, True)
     assert one.volume == pytest.approx(other.volume, rel=1e-14)
