@@ -4,7 +4,6 @@ Run with ``make accuracy``, or with ``--table`` on any table.
 """
 
 import argparse
-import tempfile
 from collections import Counter
 from pathlib import Path
 
@@ -12,8 +11,7 @@ import numpy as np
 
 from rayfix.evaluation.accuracy import drop_uniformly, locate_drops
 from rayfix.evaluation.simulate import Noise, Timing
-from rayfix.example.files import write_example
-from rayfix_offline.build import build_table
+from rayfix.evaluation.tables import open_or_build
 from rayfix_service.fusion.locator import Locator
 from rayfix_tables.table import Table
 
@@ -35,14 +33,8 @@ def main() -> None:
     parser.add_argument("--drops", type=int, default=300)
     parser.add_argument("--seed", type=int, default=2026)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        path = options.table
-        if path is None:
-            path = Path(folder) / "hall.h5"
-            print("building the hall's table ...", flush=True)
-            summary = build_table(write_example(folder), path)
-            print(f"{summary.num_bytes / 1e6:.0f} MB in {summary.seconds:.0f} s")
-        measure(Table.open(path), options.drops, options.seed)
+    with open_or_build(options.table) as table:
+        measure(table, options.drops, options.seed)
 
 
 def measure(table: Table, count: int, seed: int) -> None:

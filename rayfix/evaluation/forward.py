@@ -9,7 +9,7 @@ bounce hits a triangle of its plane, the vertices before and after the bounce li
 no triangle crosses a segment between its ends.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,6 +52,10 @@ class Paths:
     def __len__(self) -> int:
         """Return the number of paths."""
         return len(self.path_length)
+
+    def only(self, index: int) -> "Paths":
+        """Leave one path, as a set of its own."""
+        return Paths(**{field.name: getattr(self, field.name)[index : index + 1] for field in fields(self)})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,0 +1,59 @@
+"""The benchmarks of fixes run on a small table and print a figure for each case."""
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+def run(name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> list[str]:
+    """Lines that a benchmark prints."""
+    monkeypatch.setattr("sys.argv", [name, *arguments])
+    runpy.run_path(str(BENCHMARKS / name), run_name="__main__")
+    return capsys.readouterr().out.splitlines()
+
+
+@pytest.mark.slow
+def test_calibration(
+    hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ["--table", str(hall_table_path), "--drops", "8", "--select", "random"]
+    lines = run("calibration.py", capsys, monkeypatch, *arguments)
+    rows = [line.split() for line in lines[3:]]
+    assert [(row[1], float(row[0])) for row in rows] == [
+        (timing, deviation) for timing in ("none", "pt", "tdoa") for deviation in (0.25, 1.0, 5.0)
+    ]
+    # The shares of the four ellipsoids grow with their probability.
+    for row in rows:
+        shares = [float(row[2 + 3 * n]) for n in range(4)]
+        assert shares == sorted(shares)
+        assert 0.0 <= shares[0] <= shares[-1] <= 100.0
+
+
+@pytest.mark.slow
+def test_stress(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = run("stress.py", capsys, monkeypatch, "--table", str(hall_table_path), "--drops", "12")
+    assert [line[:28].strip() for line in lines if line.startswith(("random", "PT +", "ToA +"))] == [
+        "random angle, no times",
+        "random angle, PT",
+        "PT + 10 m",
+        "ToA + 10 m",
+    ]
+    buildings = [line for line in lines if ", angles" in line]
+    assert len(buildings) == 10
+    for line in buildings:
+        median, most = (float(value) for value in line[41:].split()[:2])
+        assert 0.0 < median <= most
+
+
+@pytest.mark.slow
+def test_fusion(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ["--table", str(hall_table_path), "--reports", "3", "--paper-reports", "1"]
+    lines = run("fusion.py", capsys, monkeypatch, *arguments)
+    rows = lines[3:]
+    assert [row[:12].strip() for row in rows] == ["AoA + PT", "AoA + ToA", "AoA + TDoA", "AoA", "PT", "TDoA"]
+    for row in rows:
+        ours, _, error, _, theirs = (float(value) for value in row[12:].split()[:5])
+        assert min(ours, theirs, error) > 0.0
