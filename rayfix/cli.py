@@ -72,9 +72,11 @@ def _parser() -> argparse.ArgumentParser:
     verify = add("verify", _verify, "read a whole table and compare its checksums")
     verify.add_argument("table", type=Path, metavar="T.h5")
 
-    locate = add("locate", _locate, "locate one report")
+    locate = add("locate", _locate, "locate the reports of a file")
     locate.add_argument("table", type=Path, metavar="T.h5")
     locate.add_argument("report", type=Path, metavar="REPORT.json")
+    locate.add_argument("--format", choices=_INPUTS, default="native", help="format of the report (default: native)")
+    _add_output_arguments(locate)
     locate.add_argument("--json", action="store_true", help="the answer of the HTTP interface")
 
     serve = add("serve", _serve, "serve a table over HTTP")
@@ -83,6 +85,21 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
     serve.add_argument("--workers", type=int, default=1, help="processes that answer (default: 1)")
     return parser
+
+
+_INPUTS = ("native", "nrppa", "silabs", "ublox")
+_OUTPUTS = ("native", "3gpp", "omlox")
+
+
+def _add_output_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--output", choices=_OUTPUTS, default="native", help="format of the answer (default: native)")
+    command.add_argument(
+        "--station",
+        action="append",
+        default=[],
+        metavar="NAME=STATION",
+        help="the station that the report calls NAME; may be given several times",
+    )
 
 
 def _jobs(text: str) -> int:
@@ -169,11 +186,22 @@ def _locate(options: argparse.Namespace) -> int:
     with needs_extra("service"):
         from rayfix.console import print_fix
         from rayfix.locate import locate_file
-    document = locate_file(options.table, options.report)
-    if options.json:
-        print(json.dumps(document, indent=2))
-    else:
-        print_fix(document)
+        from rayfix_service.adapters.adapted import station_map
+    answers = locate_file(
+        options.table,
+        options.report,
+        input_format=options.format,
+        output_format=options.output,
+        stations=station_map(options.station),
+    )
+    for document in answers:
+        if options.json or options.output != "native":
+            # Several are one a line, which is what programs read.
+            print(json.dumps(document, indent=2 if len(answers) == 1 else None))
+        else:
+            if len(answers) > 1:
+                print(f"{document['target_id']}:")
+            print_fix(document)
     return 0
 
 

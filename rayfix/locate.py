@@ -1,17 +1,34 @@
-"""Locate a report that lies in a file."""
+"""Locate reports that lie in a file."""
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rayfix_service.adapters.adapted import error_in_message
+from rayfix_service.adapters.formats import InputFormat, OutputFormat, parse, write
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.wire import fix_to_document, parse_report
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
 
 
-def locate_file(table_path: Path, report_path: Path) -> dict[str, Any]:
-    """Answer a report file as ``POST /v1/positions`` would.
+def locate_file(
+    table_path: Path,
+    report_path: Path,
+    *,
+    input_format: InputFormat = "native",
+    output_format: OutputFormat = "native",
+    stations: Mapping[str, str] | None = None,
+) -> list[dict[str, Any]]:
+    """Answer a file as the HTTP interface would: with one position, or for u-blox lines with as many as they tell of.
+
+    Parameters
+    ----------
+    table_path, report_path : pathlib.Path
+    input_format, output_format : str
+        Formats of docs/formats.md.
+    stations : Mapping, optional
+        Stations by the names that the file has for them.
 
     Raises
     ------
@@ -23,11 +40,26 @@ def locate_file(table_path: Path, report_path: Path) -> dict[str, Any]:
     try:
         body = report_path.read_bytes()
     except OSError as error:
-        raise ReportError(f"{report_path} cannot be read ({error.strerror}); give a JSON report") from error
+        raise ReportError(f"{report_path} cannot be read ({error.strerror}); give a file with a report") from error
     table = Table.open(table_path)
-    begin = time.perf_counter()
+    locator = Locator(table)
+    answers = []
     try:
-        fix = Locator(table).locate(parse_report(body))
+        for adapted in parse(body, input_format, stations):
+            begin = time.perf_counter()
+            try:
+                fix = locator.locate(adapted.report)
+            except ReportError as error:
+                raise error if input_format == "native" else error_in_message(error, adapted) from None
+            answers.append(
+                write(
+                    fix,
+                    output_format,
+                    table.site,
+                    compute_seconds=time.perf_counter() - begin,
+                    adapted=None if input_format == "native" else adapted,
+                )
+            )
     except ReportError as error:
         raise ReportError(f"{report_path}: {error}", path=error.path) from error
-    return fix_to_document(fix, time.perf_counter() - begin)
+    return answers

@@ -69,6 +69,42 @@ def test_example_check_build_info_verify_locate(
     assert re.match(r"ok: \(\d+\.\d\d, \d+\.\d\d, \d+\.\d\d\) m\n", out)
 
 
+def test_locate_takes_and_gives_other_formats(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, hall_table_path: Path
+) -> None:
+    lines = tmp_path / "lines.txt"
+    angles = {"A1": (15, -6), "A2": (33, -13), "A3": (-42, -3)}
+    lines.write_text(
+        "".join(
+            f'+UUDF:TAG{n},-53,{azimuth},{elevation},0,37,"{anchor}","",1437347,7\n'
+            for n in (1, 2)
+            for anchor, (azimuth, elevation) in angles.items()
+        ),
+        encoding="utf-8",
+    )
+    stations = [word for n in (1, 2, 3) for word in ("--station", f"A{n}=bs{n}")]
+    command = ("locate", hall_table_path, lines, "--format", "ublox", *stations)
+    status, out, err = run(capsys, *command, "--output", "omlox")
+    assert (status, err) == (0, "")
+    locations = [json.loads(line) for line in out.splitlines()]
+    assert [location["provider_id"] for location in locations] == ["TAG1", "TAG2"]
+    # The target stands there, and half a degree of rounding at 9 m is 8 cm for each of three stations.
+    for location in locations:
+        assert np.linalg.norm(np.subtract(location["position"]["coordinates"], [7.0, 4.0, 1.5])) < 0.5
+    status, out, err = run(capsys, *command)
+    assert (status, err) == (0, "")
+    assert out.startswith("TAG1:\n")
+    assert "TAG2:\n" in out
+
+    status, _, err = run(capsys, *command[:5])
+    assert status == 2
+    assert "lines.txt: lines[0]: station 'A1' is not in the table" in one_line(err)
+    assert "say with stations which one is meant" in err
+    status, _, err = run(capsys, *command, "--station", "A1")
+    assert status == 2
+    assert "station 'A1' is no pair; give NAME=STATION" in one_line(err)
+
+
 def test_build_writes_a_table_and_a_summary(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     run(capsys, "example", tmp_path)
     site = tmp_path / "site.toml"

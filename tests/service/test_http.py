@@ -20,7 +20,14 @@ from fastapi import FastAPI
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.http.app import create_app
 from rayfix_service.http.dependencies import BodyLimits
-from rayfix_service.http.examples import BATCH_EXAMPLES, PROBLEM_EXAMPLE, REPORT_EXAMPLES
+from rayfix_service.http.examples import (
+    BATCH_EXAMPLES,
+    NRPPA_EXAMPLES,
+    PROBLEM_EXAMPLE,
+    REPORT_EXAMPLES,
+    SILABS_EXAMPLES,
+    UBLOX_EXAMPLES,
+)
 from rayfix_service.http.problems import KINDS, Problem
 from rayfix_service.http.server import (
     serve,
@@ -573,15 +580,19 @@ def test_every_example_of_the_openapi_document_works(client: Client, openapi: di
     tried = 0
     for path, operations in openapi["paths"].items():
         content = operations.get("post", {}).get("requestBody", {}).get("content", {})
-        for example in content.get("application/json", {}).get("examples", {}).values():
-            response = client.post(path, example["value"])
+        ((media_type, body),) = content.items() or ((None, {}),)
+        for example in body.get("examples", {}).values():
+            value = example["value"]
+            data = value if isinstance(value, str) else json.dumps(value)
+            response = client.post_bytes(path, data, {"content-type": str(media_type)})
             assert response.status_code == 200, response.text
             for fix in response.json().get("results", [response.json()]):
                 assert fix["position"] is not None
                 assert fix["status"] in ("ok", "ambiguous")
                 assert all(measurement["used"] for measurement in fix["measurements"])
             tried += 1
-    assert tried == len(REPORT_EXAMPLES) + len(BATCH_EXAMPLES)
+    examples = (REPORT_EXAMPLES, BATCH_EXAMPLES, NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES)
+    assert tried == sum(len(group) for group in examples)
 
 
 def test_every_reference_of_the_openapi_document_leads_somewhere(openapi: dict[str, Any]):
@@ -608,6 +619,9 @@ def test_every_error_of_the_openapi_document_is_a_problem(openapi: dict[str, Any
     assert statuses == {
         "/v1/positions": {"200", "400", "413", "415", "422", "503"},
         "/v1/positions/batch": {"200", "400", "413", "415", "422", "503"},
+        "/v1/positions/nrppa": {"200", "400", "413", "415", "422", "503"},
+        "/v1/positions/silabs": {"200", "400", "413", "415", "422", "503"},
+        "/v1/positions/ublox": {"200", "413", "415", "422", "503"},
         "/v1/table": {"200", "503"},
         "/v1/stations": {"200", "503"},
         "/livez": {"200"},

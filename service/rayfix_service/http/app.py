@@ -9,8 +9,10 @@ from typing import Any
 from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
+from rayfix_service.adapters.nrppa_documents import NrppaDocument
+from rayfix_service.adapters.silabs import SilabsDocument
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.http import routes_health, routes_positions, routes_table
+from rayfix_service.http import routes_formats, routes_health, routes_positions, routes_table
 from rayfix_service.http.dependencies import BodyLimits, Service
 from rayfix_service.http.problems import Problem, install_problems
 from rayfix_service.wire import BatchDocument, ReportDocument
@@ -36,6 +38,8 @@ class RayfixApp(FastAPI):
                 [
                     (ReportDocument, "validation"),
                     (BatchDocument, "validation"),
+                    (NrppaDocument, "validation"),
+                    (SilabsDocument, "validation"),
                     (Problem, "serialization"),
                 ],
                 ref_template="#/components/schemas/{model}",
@@ -80,6 +84,7 @@ def create_app(table_path: Path, *, body_limits: BodyLimits | None = None) -> Fa
     app.state.body_limits = body_limits or BodyLimits()
     install_problems(app)
     app.include_router(routes_positions.router)
+    app.include_router(routes_formats.router)
     app.include_router(routes_table.router)
     app.include_router(routes_health.router)
     return app

@@ -91,11 +91,11 @@ async def get_locator(request: Request) -> Locator:
 LocatorDep = Annotated[Locator, Depends(get_locator)]
 
 
-def body_reader(limit_of: Callable[[BodyLimits], int]) -> Callable[[Request], Awaitable[bytes]]:
-    """Make the dependency that reads a JSON body within a limit."""
+def body_reader(limit_of: Callable[[BodyLimits], int], *, text: bool = False) -> Callable[[Request], Awaitable[bytes]]:
+    """Make the dependency that reads a body, JSON or plain text, within a limit."""
 
     async def read_body(request: Request) -> bytes:
-        _require_json(request.headers.get("content-type"))
+        (_require_text if text else _require_json)(request.headers.get("content-type"))
         limit = limit_of(request.app.state.body_limits)
         announced = request.headers.get("content-length", "")
         if announced.isdecimal() and int(announced) > limit:
@@ -115,17 +115,32 @@ def body_reader(limit_of: Callable[[BodyLimits], int]) -> Callable[[Request], Aw
 
 ReportBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.report))]
 BatchBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.batch))]
+LinesBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.report, text=True))]
 
 
 def _require_json(content_type: str | None) -> None:
-    media_type = (content_type or "").partition(";")[0].strip().lower()
+    media_type = _media_type(content_type)
     if media_type == "application/json" or (media_type.startswith("application/") and media_type.endswith("+json")):
         return
-    found = f"is {media_type[:100]!r}" if media_type else "is missing"
-    raise ProblemError(
+    raise _unsupported(media_type, "JSON", "application/json")
+
+
+def _require_text(content_type: str | None) -> None:
+    media_type = _media_type(content_type)
+    if media_type != "text/plain":
+        raise _unsupported(media_type, "lines of text", "text/plain")
+
+
+def _media_type(content_type: str | None) -> str:
+    return (content_type or "").partition(";")[0].strip().lower()
+
+
+def _unsupported(found: str, what: str, wanted: str) -> ProblemError:
+    return ProblemError(
         UNSUPPORTED_MEDIA_TYPE,
-        f"the Content-Type {found}; send JSON with the header Content-Type: application/json",
-        headers={"Accept": "application/json"},
+        f"the Content-Type is {repr(found[:100]) if found else 'missing'}; "
+        f"send {what} with the header Content-Type: {wanted}",
+        headers={"Accept": wanted},
     )
 
 

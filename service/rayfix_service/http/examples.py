@@ -126,3 +126,168 @@ PROBLEM_EXAMPLE: dict[str, Any] = {
     "errors": [{"path": "measurements[0].azimuth_stdev_deg", "message": _MESSAGE}],
 }
 """The answer to a report that cannot be used."""
+
+
+def _ul_aoa(azimuth: int, zenith: int) -> dict[str, Any]:
+    return {
+        "measuredResultsValue": {"uL-AngleOfArrival": {"azimuthAoA": azimuth, "zenithAoA": zenith}},
+        "measurementQuality": {
+            "angleMeasQuality": {"azimuthQuality": 10, "zenithQuality": 10, "resolution": "deg0dot1"}
+        },
+    }
+
+
+_TIMING = {"timingMeasQuality": {"measurementQuality": 5, "resolution": "m0dot1"}}
+_TRPS = {"1": "bs1", "2": "bs2", "3": "bs3"}
+
+# The same directions: the hall's +y axis points north, so that azimuths from there are 90 deg less.
+NRPPA_EXAMPLES: dict[str, dict[str, Any]] = {
+    "ul_aoa_and_ul_rtoa": {
+        "summary": "UL-AoA and UL-RTOA of two TRPs",
+        "value": {
+            "target_id": "ue-7",
+            "stations": _TRPS,
+            "TRP-MeasurementResponseList": [
+                {
+                    "tRP-ID": 1,
+                    "measurementResult": [
+                        _ul_aoa(2999, 960),
+                        {
+                            "measuredResultsValue": {"uL-RTOA": {"uLRTOAmeas": {"k1": 492943}}},
+                            "measurementQuality": _TIMING,
+                        },
+                    ],
+                },
+                {
+                    "tRP-ID": 2,
+                    "measurementResult": [
+                        _ul_aoa(124, 1033),
+                        {
+                            "measuredResultsValue": {"uL-RTOA": {"uLRTOAmeas": {"k1": 492929}}},
+                            "measurementQuality": _TIMING,
+                        },
+                    ],
+                },
+            ],
+        },
+    },
+    "multi_rtt": {
+        "summary": "UL-AoA of two TRPs, and the round trip to one of them",
+        "value": {
+            "target_id": "ue-7",
+            "stations": _TRPS,
+            "TRP-MeasurementResponseList": [
+                {
+                    "tRP-ID": 1,
+                    "measurementResult": [
+                        _ul_aoa(2999, 960),
+                        {
+                            "measuredResultsValue": {"gNB-RxTxTimeDiff": {"rxTxTimeDiff": {"k0": 990025}}},
+                            "measurementQuality": _TIMING,
+                        },
+                    ],
+                },
+                {"tRP-ID": 3, "measurementResult": [_ul_aoa(1768, 931)]},
+            ],
+            "ue_rx_tx": [
+                {
+                    "tRP-ID": 1,
+                    "nr-UE-RxTxTimeDiff-r16": {"k0-r16": 980127},
+                    "nr-TimingQuality-r16": {"timingQualityValue-r16": 5, "timingQualityResolution-r16": "mdot1"},
+                }
+            ],
+        },
+    },
+}
+"""Bodies of ``POST /v1/positions/nrppa``."""
+
+
+def _silabs(locator_id: str, azimuth: float, elevation: float) -> dict[str, Any]:
+    return {
+        "locator_id": locator_id,
+        "azimuth": azimuth,
+        "azimuth_stdev": 1.2,
+        "elevation": elevation,
+        "elevation_stdev": 1.1,
+        "distance": 0.0,
+        "distance_stdev": 0.0,
+        "sequence": 4711,
+    }
+
+
+# The hall's stations are turned by 45, 135 and -135 deg; clockwise azimuths count from there.
+SILABS_EXAMPLES: dict[str, dict[str, Any]] = {
+    "three_locators": {
+        "summary": "One packet, heard by three locators",
+        "value": {
+            "target_id": "ble-pd-60A423C96B9A",
+            "stations": {"ble-pd-0C4314F46CDC": "bs1", "ble-pd-0C4314F46D0B": "bs2", "ble-pd-0C4314F46B25": "bs3"},
+            "angles": [
+                _silabs("ble-pd-0C4314F46CDC", 15.1, -6.1),
+                _silabs("ble-pd-0C4314F46D0B", 32.6, -13.3),
+                _silabs("ble-pd-0C4314F46B25", -41.8, -3.1),
+            ],
+        },
+    }
+}
+"""Bodies of ``POST /v1/positions/silabs``."""
+
+UBLOX_EXAMPLES: dict[str, dict[str, Any]] = {
+    "three_anchors": {
+        "summary": "One transmission of a tag, heard by three anchors whose ids are those of stations",
+        "value": """\
++UUDF:6C1DEBA5F60C,-53,15,-6,0,37,"bs1","",1437347,40871
++UUDF:6C1DEBA5F60C,-50,33,-13,0,37,"bs2","",238777,40871
++UUDF:6C1DEBA5F60C,-61,-42,-3,0,37,"bs3","",1129320,40871
+""",
+    }
+}
+"""Bodies of ``POST /v1/positions/ublox``."""
+
+_OUTCOMES = ("uL-AngleOfArrival", "uL-RTOA")
+
+ADAPTED_FIX_EXAMPLE: dict[str, Any] = {
+    **FIX_EXAMPLE,
+    "target_id": "ue-7",
+    "timestamp": None,
+    "measurements": [
+        {
+            "index": n,
+            "used": True,
+            "outlier_probability": 0.0,
+            "source": f"['TRP-MeasurementResponseList'][0].measurementResult[{n}].measuredResultsValue['{name}']",
+        }
+        for n, name in enumerate(_OUTCOMES)
+    ],
+    "skipped": [],
+}
+"""An answer to a message of another format."""
+
+LOCAL_3D_EXAMPLE: dict[str, Any] = {
+    "shape": "LOCAL_3D_POINT_UNCERTAINTY_ELLIPSOID",
+    "localOrigin": {"coordinateId": "hall", "horizAxesOrientation": 0},
+    "point": _POSITION,
+    "uncertaintyEllipsoid": {"semiMajor": 0.86, "semiMinor": 0.27, "vertical": 0.28, "orientationMajor": 60},
+    "confidence": 67,
+}
+"""An answer with ``output=3gpp``."""
+
+OMLOX_EXAMPLE: dict[str, Any] = {
+    "position": {"type": "Point", "coordinates": [6.81, 3.94, 1.57]},
+    "source": "hall",
+    "provider_type": "unknown",
+    "provider_id": "agv-7",
+    "crs": "local",
+    "accuracy": 0.48,
+    "elevation_ref": "floor",
+    "floor": 0,
+    "properties": {
+        "rayfix.status": "ok",
+        "rayfix.probability": 0.986,
+        "rayfix.vertical_accuracy_m": 0.15,
+        "rayfix.covariance_m2": _COVARIANCE,
+        "rayfix.table_id": FIX_EXAMPLE["table_id"],
+    },
+    "timestamp_generated": "2026-01-31T10:00:00.250Z",
+}
+"""An answer with ``output=omlox``."""

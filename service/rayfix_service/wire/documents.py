@@ -45,6 +45,10 @@ def _rfc3339(text: str) -> str:
     return text
 
 
+Rfc3339 = Annotated[str, AfterValidator(_rfc3339)]
+"""A date-time of RFC 3339, kept as the text it is."""
+
+
 def _number(low: float, high: float, what: str, hint: str = "") -> Any:
     """Field of a number between `low` and `high`, both included."""
     return Field(ge=low, le=high, description=f"{what}, {low:g} to {high:g}" + (hint and f" ({hint})"))

@@ -1,0 +1,107 @@
+"""A foreign message as a report of this project, with the way back to its fields."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from rayfix_service.fusion.report import Measurement, Report
+from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportError
+from rayfix_service.wire.problems import Path, path_text
+from rayfix_tables.errors import ReportError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Skipped:
+    """A measurement of the message that the report does not hold.
+
+    Attributes
+    ----------
+    path : tuple of (str or int)
+        Where it stands in the message.
+    reason : str
+        Why it is left out.
+    """
+
+    path: Path
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adapted:
+    """A report made from a message of another format.
+
+    Attributes
+    ----------
+    report : Report
+    sources : tuple of tuple of (str or int)
+        Where in the message each measurement of ``report`` comes from, in its order.
+    skipped : tuple of Skipped
+        Measurements of the message that are not in ``report``.
+    """
+
+    report: Report
+    sources: tuple[Path, ...]
+    skipped: tuple[Skipped, ...] = ()
+
+
+def adapted_report(
+    measurements: list[tuple[Path, Measurement]],
+    skipped: list[Skipped],
+    *,
+    target_id: str | None,
+    timestamp: str | None,
+) -> Adapted:
+    """Put measurements and what was left out together.
+
+    Raises
+    ------
+    InvalidReportError
+        When no measurement is left, with the reasons, or when there are too many.
+    """
+    if not measurements:
+        problems = tuple(
+            FieldProblem(path=skip.path, message=f"{path_text(skip.path)} is not used: {skip.reason}")
+            for skip in skipped
+        )
+        empty = FieldProblem(path=(), message="the message has no measurements; give at least one")
+        raise InvalidReportError(problems or (empty,))
+    if len(measurements) > MAX_MEASUREMENTS:
+        text = f"the message has {len(measurements)} measurements; give at most {MAX_MEASUREMENTS} at once"
+        raise InvalidReportError((FieldProblem(path=(), message=text),))
+    return Adapted(
+        report=Report(measurements=tuple(m for _, m in measurements), target_id=target_id, timestamp=timestamp),
+        sources=tuple(path for path, _ in measurements),
+        skipped=tuple(skipped),
+    )
+
+
+def station_of(name: str, *maps: Mapping[str, str] | None) -> str:
+    """Return the station that another system calls `name`: what the first map with it says, else the name itself."""
+    return next((stations[name] for stations in maps if stations and name in stations), name)
+
+
+def error_in_message(error: ReportError, adapted: Adapted) -> InvalidReportError:
+    """Say of an error of the report where in the message it comes from."""
+    source: Path = ()
+    if len(error.path) > 1 and error.path[0] == "measurements" and isinstance(error.path[1], int):
+        source = adapted.sources[error.path[1]]
+    text = f"{path_text(source)}: {error}; say with stations which one is meant" if source else str(error)
+    return InvalidReportError((FieldProblem(path=source, message=text),))
+
+
+def station_map(pairs: Iterable[str]) -> dict[str, str]:
+    """Read ``NAME=STATION`` pairs of the command line or of a query.
+
+    Raises
+    ------
+    ReportError
+        For a pair that is none.
+    """
+    stations = {}
+    for pair in pairs:
+        name, equals, station = pair.rpartition("=")
+        if not (name and equals and station):
+            raise ReportError(
+                f"station {pair!r} is no pair; give NAME=STATION, e.g. CD84C98B935D=bs1", path=("station",)
+            )
+        stations[name] = station
+    return stations

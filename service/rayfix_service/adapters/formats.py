@@ -1,0 +1,92 @@
+"""The formats by their names, as the command line and the HTTP interface know them."""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from rayfix_service.adapters.adapted import Adapted
+from rayfix_service.adapters.nrppa import parse_nrppa
+from rayfix_service.adapters.omlox import fix_to_omlox
+from rayfix_service.adapters.silabs import parse_silabs
+from rayfix_service.adapters.threegpp import fix_to_3gpp
+from rayfix_service.adapters.ublox import parse_ublox
+from rayfix_service.fusion.report import Fix
+from rayfix_service.wire import fix_to_document, parse_report
+from rayfix_service.wire.problems import path_text
+from rayfix_tables.site import SiteInfo
+
+InputFormat = Literal["native", "nrppa", "silabs", "ublox"]
+OutputFormat = Literal["native", "3gpp", "omlox"]
+
+
+def parse(body: bytes, input_format: InputFormat, stations: Mapping[str, str] | None = None) -> tuple[Adapted, ...]:
+    """Turn a message into reports: one, or for u-blox lines as many as they tell of.
+
+    Parameters
+    ----------
+    body : bytes
+        The message.
+    input_format : {"native", "nrppa", "silabs", "ublox"}
+    stations : Mapping, optional
+        Stations by the names that the message has for them; the native format has the stations' own.
+
+    Raises
+    ------
+    MalformedJsonError
+        For bytes that are not JSON in a format that is.
+    InvalidReportError
+        For a message that is not valid.
+    """
+    match input_format:
+        case "native":
+            report = parse_report(body)
+            places = tuple(("measurements", n) for n in range(len(report.measurements)))
+            return (Adapted(report=report, sources=places),)
+        case "nrppa":
+            return (parse_nrppa(body, stations=stations),)
+        case "silabs":
+            return (parse_silabs(body, stations=stations),)
+        case "ublox":
+            return parse_ublox(body, stations=stations)
+
+
+def write(
+    fix: Fix,
+    output_format: OutputFormat,
+    site: SiteInfo,
+    *,
+    compute_seconds: float,
+    adapted: Adapted | None = None,
+) -> dict[str, Any]:
+    """Turn a fix into JSON-compatible data.
+
+    Parameters
+    ----------
+    fix : Fix
+    output_format : {"native", "3gpp", "omlox"}
+    site : SiteInfo
+        Where the fix is.
+    compute_seconds : float
+        Time that the fix took, s.
+    adapted : Adapted, optional
+        Where the report came from, if from another format; the native answer then has the ``source`` of each
+        measurement and the measurements that were ``skipped``.
+
+    Raises
+    ------
+    ReportError
+        When the fix has no position and the format needs one.
+    """
+    match output_format:
+        case "3gpp":
+            return fix_to_3gpp(fix, site)
+        case "omlox":
+            return fix_to_omlox(fix, site)
+        case "native":
+            document = fix_to_document(fix, compute_seconds)
+            if adapted is not None:
+                for outcome, source in zip(document["measurements"], adapted.sources, strict=True):
+                    outcome["source"] = path_text(source)
+                document["skipped"] = [
+                    {"source": path_text(skip.path), "reason": skip.reason} for skip in adapted.skipped
+                ]
+            return document

@@ -1,0 +1,214 @@
+"""From NRPPa measurement results (3GPP TS 38.455) to a report."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rayfix_service.adapters.adapted import Adapted, Skipped, adapted_report, station_of
+from rayfix_service.adapters.documents import check, one_of
+from rayfix_service.adapters.nrppa_documents import (
+    AngleQuality,
+    LcsToGcs,
+    LppTimingQuality,
+    NrppaDocument,
+    ResultItem,
+    TimeChoice,
+    TimingQuality,
+    UlAoa,
+    Zoa,
+)
+from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_interval, time_interval
+from rayfix_service.fusion.report import Angle, Measurement, Range, TimeOfArrival
+from rayfix_service.wire.problems import Path
+from rayfix_tables.angles import angles_of, direction, local_to_scene, wrap
+
+_RESOLUTION_M = {"m0dot1": 0.1, "mdot1": 0.1, "m1": 1.0, "m10": 10.0, "m30": 30.0}
+
+_BEYOND = "its value stands for everything beyond the range of the report mapping"
+_NO_AZIMUTH = "a zenith angle without an azimuth cannot be used; report UL-AoA with both"
+_NO_ZENITH = "an azimuth without a zenith angle cannot be turned by beta and gamma; report zenithAoA as well"
+_ALONE = "a gNB's Rx-Tx time difference is a range only together with the UE's; give that in ue_rx_tx"
+_POWER = "powers and phases are not used"
+
+
+def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, str] | None = None) -> Adapted:
+    """Turn an NRPPa measurement message into a report.
+
+    UL-AoA becomes an angle in the frame "north", since azimuths of the global coordinate system count from
+    geographic north, counter-clockwise (TS 38.215, clause 5.2.4); angles with a translation from a local
+    coordinate system are turned by it. UL-RTOA becomes a time of arrival: its reference time is the same for
+    all TRPs and unknown, as is the time of transmission. The Rx-Tx time differences of a gNB and of the UE add
+    to the round trip, so that c / 2 times their sum is the path length (TS 38.305, clause 8.10).
+
+    Parameters
+    ----------
+    message : Mapping or bytes
+        The message as :class:`NrppaDocument` describes it, or its JSON text.
+    stations : Mapping, optional
+        Stations by TRP-ID (as text), for those that the message's own map does not have. A TRP-ID in neither is
+        itself a station's identifier.
+
+    Raises
+    ------
+    MalformedJsonError
+        For bytes that are not JSON.
+    InvalidReportError
+        For a message that is not valid, or of which no measurement can be used.
+    """
+    document = check(NrppaDocument, message, what="the NRPPa message")
+    name = "TRP-MeasurementResponseList" if document.response else "TRP-MeasurementReportList"
+    measurements: list[tuple[Path, Measurement]] = []
+    skipped: list[Skipped] = []
+    for i, trp in enumerate(document.response or document.report or ()):
+        converter = _Converter(
+            document=document, trp_id=trp.trp_id, station_id=station_of(str(trp.trp_id), document.stations, stations)
+        )
+        for k, item in enumerate(trp.results):
+            path: Path = (name, i, "measurementResult", k)
+            for place, outcome in converter.convert(item):
+                if isinstance(outcome, str):
+                    skipped.append(Skipped(path=(*path, *place), reason=outcome))
+                else:
+                    measurements.append(((*path, *place), outcome))
+    return adapted_report(measurements, skipped, target_id=document.target_id, timestamp=document.timestamp)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Converter:
+    """Conversion of one TRP's measurements: pairs of a place within the item, and a measurement or a reason."""
+
+    document: NrppaDocument
+    trp_id: int
+    station_id: str
+
+    def convert(self, item: ResultItem) -> Iterator[tuple[Path, Measurement | str]]:
+        """Convert one item, which may hold several measurements or none."""
+        name, value = one_of(item.value)
+        path: Path = ("measuredResultsValue", name)
+        angle = item.quality.angle if item.quality else None
+        timing = item.quality.timing if item.quality else None
+        match name:
+            case "uL-AngleOfArrival":
+                yield path, self._angle(value, angle)
+            case "MultipleULAoA":
+                for n, choice in enumerate(value.angles):
+                    inner, one = one_of(choice)
+                    yield (*path, "multipleULAoA", n, inner), self._angle(one, angle)
+            case "ZoA":
+                yield path, _NO_AZIMUTH
+            case "uL-RTOA":
+                yield path, self._arrival(value.time, timing)
+            case "gNB-RxTxTimeDiff":
+                yield from ((path, outcome) for outcome in self._ranges(value.time, timing))
+            case _:
+                yield path, _POWER
+
+    def _angle(self, measured: UlAoa | Zoa, quality: AngleQuality | None) -> Angle | str:
+        if isinstance(measured, Zoa):
+            return _NO_AZIMUTH
+        azimuth = angle_interval(measured.azimuth, zero=math.radians(self.document.azimuth_zero_deg))
+        default = math.radians(self.document.angle_stdev_deg)
+        azimuth_stdev = math.sqrt(
+            (_steps(quality.azimuth) * ANGLE_STEP if quality else default) ** 2 + azimuth.variance
+        )
+        if measured.zenith is None:
+            if measured.translation is None:
+                turn = 0.0
+            elif measured.translation.beta == measured.translation.gamma == 0:
+                turn = measured.translation.alpha * ANGLE_STEP
+            else:
+                return _NO_ZENITH
+            return Angle(
+                station_id=self.station_id,
+                azimuth=float(wrap(azimuth.middle + turn)),
+                azimuth_stdev=azimuth_stdev,
+                frame="north",
+            )
+        zenith = angle_interval(measured.zenith)
+        known = quality.zenith if quality else None
+        zenith_stdev = math.sqrt((default if known is None else _steps(known) * ANGLE_STEP) ** 2 + zenith.variance)
+        angles = (float(wrap(azimuth.middle)), zenith.middle, azimuth_stdev, zenith_stdev)
+        if measured.translation is not None:
+            angles = _to_global(measured.translation, *angles)
+        return Angle(
+            station_id=self.station_id,
+            azimuth=angles[0],
+            zenith=angles[1],
+            azimuth_stdev=angles[2],
+            zenith_stdev=angles[3],
+            frame="north",
+        )
+
+    def _arrival(self, time: TimeChoice, quality: TimingQuality | None) -> TimeOfArrival | str:
+        measured = time_interval(*time.value_and_k())
+        if measured is None:
+            return _BEYOND
+        return TimeOfArrival(
+            station_id=self.station_id,
+            path_length=measured.middle,
+            stdev=math.sqrt(self._time_variance(measured, quality)),
+        )
+
+    def _ranges(self, time: TimeChoice, quality: TimingQuality | None) -> Iterator[Range | str]:
+        mine = time_interval(*time.value_and_k())
+        others = [ue for ue in self.document.ue_rx_tx if ue.trp_id == self.trp_id]
+        if not others:
+            yield _ALONE
+        for ue in others:
+            theirs = time_interval(*ue.time.value_and_k())
+            if mine is None or theirs is None:
+                yield _BEYOND
+                continue
+            variance = self._time_variance(mine, quality) + self._time_variance(theirs, ue.quality)
+            yield Range(
+                station_id=self.station_id,
+                path_length=0.5 * (mine.middle + theirs.middle),
+                stdev=0.5 * math.sqrt(variance),
+            )
+
+    def _time_variance(self, measured: Interval, quality: TimingQuality | LppTimingQuality | None) -> float:
+        """Variance of a time as a length, m2, that of its quantisation included."""
+        if quality is None:
+            return self.document.time_stdev_m**2 + measured.variance
+        return (_steps(quality.value) * _RESOLUTION_M[quality.resolution]) ** 2 + measured.variance
+
+
+def _steps(quality: int) -> float:
+    """Uncertainty in steps; 0 stands for less than half a step."""
+    return max(float(quality), 0.5)
+
+
+def _to_global(
+    translation: LcsToGcs, azimuth: float, zenith: float, azimuth_stdev: float, zenith_stdev: float
+) -> tuple[float, float, float, float]:
+    """Turn angles of a local coordinate system, and their deviations, by TR 38.901, equation (7.1-2).
+
+    The turned errors of azimuth and zenith are correlated unless beta and gamma are 0; a report holds deviations
+    alone, so that the correlation is left out.
+    """
+    orientation = (
+        translation.alpha * ANGLE_STEP,
+        translation.beta * ANGLE_STEP,
+        translation.gamma * ANGLE_STEP,
+    )
+    rotation = local_to_scene(orientation)
+    turned_azimuth, turned_zenith = (float(v) for v in angles_of(rotation @ direction(azimuth, zenith)))
+    along = (
+        np.array([-np.sin(azimuth), np.cos(azimuth), 0.0]) * np.sin(zenith),
+        np.array([np.cos(zenith) * np.cos(azimuth), np.cos(zenith) * np.sin(azimuth), -np.sin(zenith)]),
+    )
+    to_azimuth = np.array([-np.sin(turned_azimuth), np.cos(turned_azimuth), 0.0]) / max(np.sin(turned_zenith), 1e-9)
+    to_zenith = np.array(
+        [
+            np.cos(turned_zenith) * np.cos(turned_azimuth),
+            np.cos(turned_zenith) * np.sin(turned_azimuth),
+            -np.sin(turned_zenith),
+        ]
+    )
+    errors = np.stack([rotation @ along[0] * azimuth_stdev, rotation @ along[1] * zenith_stdev], axis=-1)
+    # Beyond a full turn an azimuth is unknown, which is the case right at the zenith.
+    stdev_azimuth = min(float(np.linalg.norm(to_azimuth @ errors)), 2.0 * np.pi)
+    return turned_azimuth, turned_zenith, stdev_azimuth, float(np.linalg.norm(to_zenith @ errors))

@@ -1,0 +1,58 @@
+"""A position as a location object of omlox hubs (omlox Hub API, version 2)."""
+
+import re
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from rayfix_service.adapters.positions import best_candidate
+from rayfix_service.fusion.report import Fix
+from rayfix_service.wire import horizontal_accuracy, vertical_accuracy
+from rayfix_tables.site import SiteInfo
+
+UNKNOWN_PROVIDER = "unknown"
+"""Provider id of a fix without a target, since a location must have one, and provider type of all."""
+
+
+def fix_to_omlox(fix: Fix, site: SiteInfo) -> dict[str, Any]:
+    """Describe the best candidate of a fix as an omlox Location.
+
+    The position is in the scene frame, so that ``crs`` is "local" and ``source``, the site's name, should be the
+    foreign id of the hub's zone. What the format has no place for stands in ``properties``.
+
+    Raises
+    ------
+    ReportError
+        When the fix has no position.
+    """
+    candidate = best_candidate(fix)
+    location: dict[str, Any] = {
+        "position": {"type": "Point", "coordinates": candidate.position.tolist()},
+        "source": site.name,
+        "provider_type": UNKNOWN_PROVIDER,
+        "provider_id": fix.target_id or UNKNOWN_PROVIDER,
+        "crs": "local",
+        "accuracy": horizontal_accuracy(candidate.covariance),
+        "elevation_ref": "floor",
+        "floor": 0,
+        "properties": {
+            "rayfix.status": fix.status,
+            "rayfix.probability": float(candidate.probability),
+            "rayfix.vertical_accuracy_m": vertical_accuracy(candidate.covariance),
+            "rayfix.covariance_m2": candidate.covariance.tolist(),
+            "rayfix.table_id": fix.table_id,
+        },
+    }
+    if fix.timestamp is not None:
+        location["timestamp_generated"] = utc_milliseconds(fix.timestamp)
+    return location
+
+
+def utc_milliseconds(timestamp: str) -> str:
+    """Turn a date-time of RFC 3339 into UTC with milliseconds, as omlox wants it."""
+    # Python knows no leap seconds.
+    leap = re.match(r"(.{17})60", timestamp)
+    text = f"{leap[1]}59{timestamp[19:]}" if leap else timestamp
+    # Nor more than six digits of a second.
+    text = re.sub(r"(\.[0-9]{6})[0-9]+", r"\1", text.upper())
+    moment = datetime.fromisoformat(text).astimezone(UTC) + timedelta(seconds=1 if leap else 0)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

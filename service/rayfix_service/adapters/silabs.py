@@ -1,0 +1,133 @@
+"""From the angles of Silicon Labs' Bluetooth locators to a report.
+
+A locator publishes one JSON object per packet that it heard (Bluetooth SDK, ``aoa_serialize_angle``): degrees and
+metres, with the sequence number of the packet. Locator and tag are named by the MQTT topic alone.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Self
+
+from pydantic import ConfigDict, Field, model_validator
+
+from rayfix_service.adapters.adapted import Adapted, adapted_report, station_of
+from rayfix_service.adapters.documents import Stations, TargetId, Timestamp, check, misfit
+from rayfix_service.fusion.report import Angle, Frame, Measurement, Range
+from rayfix_service.wire import MAX_MEASUREMENTS, WireModel
+from rayfix_service.wire.problems import Path
+from rayfix_tables.angles import wrap
+
+_Stdev = Field(ge=0, le=360, description="a standard deviation in degrees, 0 to 360")
+
+LEAST_STDEV_DEG = 0.5
+"""Locators estimate the noise of an angle, not the error of their array; no smaller deviation is believed."""
+
+
+class SilabsAngle(WireModel):
+    """What a locator publishes for one packet; keys that later versions of its software add are passed over."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    azimuth: float = Field(ge=-360, le=360, description="an azimuth in degrees, clockwise, -360 to 360")
+    azimuth_stdev: Annotated[float, _Stdev]
+    elevation: Annotated[float, Field(ge=-90, le=90, description="an elevation in degrees, -90 to 90")] | None = None
+    elevation_stdev: Annotated[float, _Stdev] | None = None
+    distance: Annotated[float, Field(ge=0, le=1e6, description="a distance in metres, 0 to 1e+06")] | None = None
+    distance_stdev: (
+        Annotated[float, Field(ge=0, le=1e6, description="a standard deviation in metres, 0 to 1e+06")] | None
+    ) = None
+    sequence: (
+        Annotated[int, Field(ge=-(2**31), lt=2**32, description="the sequence number of the packet, an integer")] | None
+    ) = None
+
+    @model_validator(mode="after")
+    def _elevation_whole(self) -> Self:
+        if (self.elevation is None) != (self.elevation_stdev is None):
+            missing = "elevation" if self.elevation is None else "elevation_stdev"
+            raise misfit(missing, "is missing; give elevation and elevation_stdev, or neither")
+        return self
+
+
+class SilabsLocatorAngle(SilabsAngle):
+    """The same with the locator, which the topic names in MQTT."""
+
+    locator_id: str = Field(min_length=1, max_length=128, description="the locator's name, 1 to 128 characters")
+
+
+class SilabsDocument(WireModel):
+    """The angles that locators measured of one packet of one tag."""
+
+    model_config = ConfigDict(title="SilabsReport")
+
+    target_id: TargetId = None
+    timestamp: Timestamp = None
+    stations: Stations = None
+    frame: Frame = Field(default="lcs", description='one of "lcs", "scene" and "north", the frame of the angles')
+    least_stdev_deg: float = Field(
+        default=LEAST_STDEV_DEG, ge=1e-6, le=360, description="the least standard deviation to believe, 1e-06 to 360"
+    )
+    angles: list[SilabsLocatorAngle] = Field(
+        min_length=1, max_length=MAX_MEASUREMENTS, description=f"an array of 1 to {MAX_MEASUREMENTS} angles"
+    )
+
+
+def parse_silabs(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, str] | None = None) -> Adapted:
+    """Turn the angles of one packet into a report.
+
+    Parameters
+    ----------
+    message : Mapping or bytes
+        The message as :class:`SilabsDocument` describes it, or its JSON text.
+    stations : Mapping, optional
+        Stations by locator, for those that the message's own map does not have. A locator in neither is itself a
+        station's identifier.
+
+    Raises
+    ------
+    MalformedJsonError
+        For bytes that are not JSON.
+    InvalidReportError
+        For a message that is not valid.
+    """
+    document = check(SilabsDocument, message, what="the message")
+    measurements: list[tuple[Path, Measurement]] = []
+    for n, angle in enumerate(document.angles):
+        station_id = station_of(angle.locator_id, document.stations, stations)
+        found = silabs_measurements(angle, station_id, frame=document.frame, least_stdev_deg=document.least_stdev_deg)
+        measurements += [(("angles", n), one) for one in found]
+    return adapted_report(measurements, [], target_id=document.target_id, timestamp=document.timestamp)
+
+
+def parse_silabs_angle(payload: bytes) -> SilabsAngle:
+    """Read the payload of a locator's MQTT message.
+
+    Raises
+    ------
+    MalformedJsonError
+        For bytes that are not JSON.
+    InvalidReportError
+        For JSON that is not an angle.
+    """
+    return check(SilabsAngle, payload, what="the angle")
+
+
+def silabs_measurements(
+    angle: SilabsAngle, station_id: str, *, frame: Frame = "lcs", least_stdev_deg: float = LEAST_STDEV_DEG
+) -> tuple[Measurement, ...]:
+    """Turn one locator's angle into measurements: the azimuth's sign changes, and zenith = 90 deg - elevation.
+
+    The distance, which locators guess from the signal strength, counts as a propagation time where it comes with
+    a positive deviation; the least deviation applies to angles alone.
+    """
+    least = math.radians(least_stdev_deg)
+    measured = Angle(
+        station_id=station_id,
+        azimuth=float(wrap(math.radians(-angle.azimuth))),
+        azimuth_stdev=max(math.radians(angle.azimuth_stdev), least),
+        zenith=None if angle.elevation is None else math.radians(90.0 - angle.elevation),
+        zenith_stdev=None if angle.elevation_stdev is None else max(math.radians(angle.elevation_stdev), least),
+        frame=frame,
+    )
+    if angle.distance is None or not angle.distance_stdev:
+        return (measured,)
+    return measured, Range(station_id=station_id, path_length=angle.distance, stdev=max(angle.distance_stdev, 1e-6))

@@ -1,0 +1,93 @@
+"""Routes that locate from messages of other systems; docs/formats.md describes them."""
+
+import asyncio
+from functools import partial
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+
+from rayfix_service.adapters.adapted import Adapted, station_map
+from rayfix_service.adapters.nrppa import parse_nrppa
+from rayfix_service.adapters.nrppa_documents import NrppaDocument
+from rayfix_service.adapters.silabs import SilabsDocument, parse_silabs
+from rayfix_service.adapters.ublox import parse_ublox
+from rayfix_service.http.dependencies import LinesBody, LocatorDep, ReportBody
+from rayfix_service.http.examples import NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
+from rayfix_service.http.locating import answer, answer_or_problem
+from rayfix_service.http.outputs import (
+    ADAPTED_ANSWER,
+    POSITION_PROBLEMS,
+    AdaptedOrOther,
+    Output,
+    request_body,
+)
+from rayfix_service.http.problems import CONNECTION_ENDED, MALFORMED_JSON, Problem, ProblemError
+
+router = APIRouter(prefix="/v1/positions", tags=["formats"])
+
+
+class LinesResult(BaseModel):
+    """The answers to lines, one for each transmission of each tag."""
+
+    results: list[AdaptedOrOther | Problem] = Field(
+        description="a fix in the format of the query parameter output, or the problem of that report"
+    )
+
+
+@router.post(
+    "/nrppa",
+    summary="Locate from NRPPa measurements",
+    response_model=AdaptedOrOther,
+    responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
+    openapi_extra=request_body(NrppaDocument, NRPPA_EXAMPLES),
+)
+async def post_nrppa(locator: LocatorDep, body: ReportBody, output: Output = "native") -> JSONResponse:
+    """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
+    return JSONResponse(await answer(locator, parse_nrppa(body), output))
+
+
+@router.post(
+    "/silabs",
+    summary="Locate from Silicon Labs locators",
+    response_model=AdaptedOrOther,
+    responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
+    openapi_extra=request_body(SilabsDocument, SILABS_EXAMPLES),
+)
+async def post_silabs(locator: LocatorDep, body: ReportBody, output: Output = "native") -> JSONResponse:
+    """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
+    return JSONResponse(await answer(locator, parse_silabs(body), output))
+
+
+@router.post(
+    "/ublox",
+    summary="Locate from u-blox anchors",
+    response_model=LinesResult,
+    responses={status: problem for status, problem in POSITION_PROBLEMS.items() if status != MALFORMED_JSON.status},
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"text/plain": {"schema": {"type": "string"}, "examples": UBLOX_EXAMPLES}},
+        }
+    },
+)
+async def post_ublox(
+    request: Request,
+    locator: LocatorDep,
+    body: LinesBody,
+    output: Output = "native",
+    station: Annotated[list[str], Query(description="ANCHOR=STATION, for anchors whose id is no station's")] = [],  # noqa: B006
+) -> JSONResponse:
+    """Take ``+UUDF`` lines of u-blox anchors and join them by tag and sequence number."""
+    results = []
+    for adapted in parse_ublox(body, stations=station_map(station)):
+        if await request.is_disconnected():
+            raise ProblemError(CONNECTION_ENDED, "the connection ended before the answer")
+        results.append(await answer_or_problem(locator, partial(_same, adapted), output))
+        await asyncio.sleep(0)
+    return JSONResponse({"results": results})
+
+
+def _same(adapted: Adapted) -> Adapted:
+    return adapted
