@@ -136,7 +136,7 @@ def measure(level: LevelRays, cells: NDArray[np.int64], points: list[NDArray[np.
             pieces.mean, pieces.variance, sequences.images, sequences.mirrors, pieces.num_slices,
             new_rows(len(sequences.images)),
         )  # fmt: skip
-        surface = sequences.surface_sequences.astype(np.int64)[seq]
+        surface = level.surface_sequences[seq]
         mass = join_groups(surface, slices, mass, mean, cov, sequences.mirrors[seq])[1]
         groups.append(len(mass))
         kept.append(np.sort(mass)[::-1][: fit.max_groups].sum() / mass.sum())
@@ -173,12 +173,11 @@ def study(name: str, windows: list[float], count: int) -> Iterator[str]:
             rng = np.random.default_rng(0)
             cells = looking_at(level, name, count, rng)
             points = [sample_points(level.grid.centres[c], drawn, HELD_OUT_POINTS, rng)[0] for c in cells]
-            alone = np.arange(len(level.sequences.images), dtype=np.int32)
-            apart = replace(level, sequences=replace(level.sequences, surface_sequences=alone))
+            apart = replace(level, surface_sequences=np.arange(len(level.sequences.images)))
             fit_tubes(level.grid.centres[cells[:1]], level, TubeFit())  # compiled before it is timed
             for how, variant in (("each", apart), ("together", level)):
                 o = measure(variant, cells, points)
-                ways = len(np.unique(variant.sequences.surface_sequences))
+                ways = len(np.unique(variant.surface_sequences))
                 yield (
                     f"| {name} | {facets} | {np.rad2deg(level.window):g} | {how} | {ways} | {o.groups:.0f} | "
                     f"{o.most_groups} | {o.kept_mass:.1%} | {o.components:.0f} | {o.milliseconds:.1f} | "

@@ -62,8 +62,6 @@ class Sequences:
     planes : ndarray of int32, shape (n_sequences,)
         Plane of the last reflection, -1 for the direct one.
     num_reflections : ndarray of int8, shape (n_sequences,)
-    surface_sequences : ndarray of int32, shape (n_sequences,)
-        First sequence that runs over the same surfaces in the same order; itself where nothing is curved.
     """
 
     images: NDArray[np.float64]
@@ -71,7 +69,6 @@ class Sequences:
     parents: NDArray[np.int32]
     planes: NDArray[np.int32]
     num_reflections: NDArray[np.int8]
-    surface_sequences: NDArray[np.int32]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,7 +173,6 @@ def launch(
     log_gain = np.zeros(sequence.shape)
     images, mirrors = [station[None, :]], [np.eye(3)[None]]
     parents, sequence_planes, depths = [np.array([-1])], [np.array([-1])], [np.array([0])]
-    surface_sequences = [np.array([0])]
     num_sequences = 1
 
     rays = np.arange(num_rays)
@@ -211,9 +207,6 @@ def launch(
         keys, inverse = np.unique(current[on] * len(planes) + plane, return_inverse=True)
         parent, mirror_plane = keys // len(planes), keys % len(planes)
         all_images, all_mirrors = np.concatenate(images), np.concatenate(mirrors)
-        over = np.concatenate(surface_sequences)[parent] * len(planes) + planes.surfaces[mirror_plane]
-        _, first, same = np.unique(over, return_index=True, return_inverse=True)
-        surface_sequences.append(num_sequences + first[same])
         n = planes.normals[mirror_plane]
         reflection = np.eye(3) - 2.0 * n[:, :, None] * n[:, None, :]
         height = np.einsum("ij,ij->i", n, all_images[parent]) - planes.offsets[mirror_plane]
@@ -239,7 +232,6 @@ def launch(
             parents=np.concatenate(parents).astype(np.int32),
             planes=np.concatenate(sequence_planes).astype(np.int32),
             num_reflections=np.concatenate(depths).astype(np.int8),
-            surface_sequences=np.concatenate(surface_sequences).astype(np.int32),
         ),
         lost_ray_share=lost / max(1, num_rays),
     )

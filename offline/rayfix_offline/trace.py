@@ -11,6 +11,7 @@ from rayfix_offline.materials import Reflectivity, constant_reflectivity, itu_re
 from rayfix_offline.pathprior import fill_path_prior
 from rayfix_offline.pieces import Pieces, cut_pieces
 from rayfix_offline.site import SiteFile, StationSection
+from rayfix_offline.surfaces import surface_sequences
 from rayfix_offline.twin import Twin
 from rayfix_tables.grid import AngularGrid
 
@@ -42,6 +43,8 @@ class LevelRays:
     window : float, rad
         Standard deviation of the cells' window.
     ray_spacing : float, rad
+    surface_sequences : ndarray of int64, shape (n_sequences,)
+        First of the sequences that run over the same surfaces as each one does; their groups are joined.
     """
 
     window: float
@@ -50,6 +53,7 @@ class LevelRays:
     ray_spacing: float
     pieces: Pieces
     sequences: Sequences
+    surface_sequences: NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,6 +125,7 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin) -> Statio
         slice_ratio=SLICE_RATIO,
         step=INTEGRATION_STEP,
     )
+    over_surfaces = surface_sequences(segments.sequences, twin.planes)
     levels = []
     for window in (float(w) for w in windows):
         level_rays, level_pieces, level_spacing = rays, pieces, spacing
@@ -136,6 +141,7 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin) -> Statio
                 ray_spacing=level_spacing,
                 pieces=level_pieces,
                 sequences=segments.sequences,
+                surface_sequences=over_surfaces,
             )
         )
     return StationTrace(levels=tuple(levels), lost_ray_share=segments.lost_ray_share, coverage=prior.coverage)

@@ -58,8 +58,7 @@ def facing(level: LevelRays) -> NDArray[np.float64]:
 
 def each_facet(level: LevelRays) -> LevelRays:
     """Return the same rays with every facet as a surface by itself."""
-    alone = np.arange(len(level.sequences.images), dtype=np.int32)
-    return replace(level, sequences=replace(level.sequences, surface_sequences=alone))
+    return replace(level, surface_sequences=np.arange(len(level.sequences.images)))
 
 
 def moments(mixture: TubeMixture) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -91,7 +90,7 @@ def test_sequences_over_the_same_surfaces(traced: dict[int, tuple[Twin, LevelRay
     first: dict[tuple[int, ...], int] = {}
     for number in range(len(sequences.images)):
         way = surfaces_on_the_way(sequences, twin.planes.surfaces, number)
-        assert sequences.surface_sequences[number] == first.setdefault(way, number)
+        assert level.surface_sequences[number] == first.setdefault(way, number)
     assert len(first) < 0.7 * len(sequences.images)
 
 

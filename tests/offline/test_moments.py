@@ -159,7 +159,6 @@ def test_the_mass_is_the_integral_of_the_window(window: float) -> None:
         parents=np.array([-1], np.int32),
         planes=np.array([-1], np.int32),
         num_reflections=np.zeros(1, np.int8),
-        surface_sequences=np.zeros(1, np.int32),
     )
     centre = (0.4, 1.2)
     ((mass, mean, cov),) = gather(Traced(rays, pieces, sequences), centre, window).values()

@@ -167,7 +167,6 @@ def test_any_segment(start: float, span: float, ratio: float) -> None:
         parents=np.array([-1], np.int32),
         planes=np.array([-1], np.int32),
         num_reflections=np.zeros(1, np.int8),
-        surface_sequences=np.zeros(1, np.int32),
     )
     segments = Segments(
         sequence=np.zeros((1, 1), np.int32),
