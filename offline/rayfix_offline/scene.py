@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import io
 import logging
+import re
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,11 +16,19 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.units import unit_conversion
 
+from rayfix_offline.ifc import read_ifc
 from rayfix_offline.mitsuba import Placed, read_mitsuba
 from rayfix_tables.errors import SceneError
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-FILE_TYPES = ("glb", "gltf", "obj", "ply", "stl", "dae", "xml")
+FILE_TYPES = ("glb", "gltf", "obj", "ply", "stl", "dae", "xml", "ifc")
+
+UPRIGHT = {
+    "x": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "z": np.eye(3),
+}
+"""Rotation that turns a file's upward axis to z."""
 
 _MIN_AREA = 1e-12
 
@@ -76,9 +85,9 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
     Parameters
     ----------
     unit : {"m", "cm", "mm", "in", "ft"}
-        Unit of the coordinates, unless the file itself says it (COLLADA does).
+        Unit of the coordinates, unless the file itself says it (COLLADA and IFC do).
     up : {"z", "y"}
-        Which axis of the file points up; "y" is turned to z.
+        Which axis of the file points up, unless the file itself says it (COLLADA and IFC do).
 
     Raises
     ------
@@ -94,12 +103,15 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
     scale = METRES_PER_UNIT[unit]
     if kind == "xml":
         meshes = read_mitsuba(path, _load_quietly)
+    elif kind == "ifc":
+        meshes, scale, up = read_ifc(path), 1.0, "z"
     else:
         loaded = _load_quietly(path)
         meshes = _placed_meshes(loaded)
         if kind == "dae":
             # trimesh reads the unit of a COLLADA file (as "0.01 * meters"), but does not apply it.
             scale = float(unit_conversion(loaded.units, "meters"))
+            up = _collada_up(path) or up
     if not meshes:
         raise SceneError(f"{path} holds no triangles; export the scene as a triangle mesh")
     if not all(np.isfinite(mesh.vertices).all() and np.isfinite(transform).all() for _, mesh, transform in meshes):
@@ -108,6 +120,12 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
     if not len(scene.faces):
         raise SceneError(f"{path} has only triangles without an area; export the scene again")
     return scene
+
+
+def _collada_up(path: Path) -> str | None:
+    """Upward axis that a COLLADA file names; trimesh does not turn it."""
+    found = re.search(rb"<up_axis>\s*([XYZ])_UP\s*</up_axis>", path.read_bytes())
+    return found[1].decode().lower() if found else None
 
 
 def _load_quietly(path: Path) -> Any:
@@ -137,7 +155,7 @@ def _placed_meshes(loaded: Any) -> list[Placed]:
 
 
 def _gather(meshes: list[Placed], *, scale: float, up: str) -> Scene:
-    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) if up == "y" else np.eye(3)
+    turn = UPRIGHT[up]
     vertices, faces, face_materials, face_objects = [], [], [], []
     materials: list[str] = []
     count = 0

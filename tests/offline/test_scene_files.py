@@ -1,5 +1,6 @@
 """Mesh files of every kind, sound and damaged."""
 
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ from rayfix_offline.scene import FILE_TYPES, METRES_PER_UNIT, Scene, load_scene
 from rayfix_tables.errors import SceneError
 
 SINGLE = 1e-6  # m; most formats store single precision, and the room is 5 m long
-KINDS = [kind for kind in FILE_TYPES if kind not in ("gltf", "xml")]
+KINDS = [kind for kind in FILE_TYPES if kind not in ("gltf", "xml", "ifc")]
 
 
 def canonical(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -55,6 +56,9 @@ def export(scene: trimesh.Scene, folder: Path, kind: str) -> Path:
     path = folder / f"room.{kind}"
     mesh = scene if kind in ("glb", "obj") else scene.to_geometry()
     mesh.export(path, file_type=kind)
+    if kind == "dae":
+        # trimesh says that y is up, whatever it writes.
+        path.write_text(path.read_text(encoding="utf-8").replace("Y_UP", "Z_UP"), encoding="utf-8")
     return path
 
 
@@ -141,6 +145,31 @@ def test_collada_units(
     assert_same_triangles(load_scene(path), expected)
 
 
+@pytest.mark.parametrize(("axis", "order", "signs"), [("X", (2, 0, 1), (1, -1, -1)), ("Y", (0, 2, 1), (1, 1, -1))])
+def test_collada_says_which_axis_is_up(
+    cluttered_scene: trimesh.Scene,
+    expected: NDArray[np.float64],
+    tmp_path: Path,
+    axis: str,
+    order: tuple[int, int, int],
+    signs: tuple[int, int, int],
+) -> None:
+    """The file has the room lying, (x, z, -y) for Y and (z, -x, -y) for X; the site's word counts for nothing."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array(signs)[:, None] * np.eye(3)[list(order)]
+    assert np.linalg.det(matrix) == pytest.approx(1.0)
+    cluttered_scene.apply_transform(matrix)
+    path = export(cluttered_scene, tmp_path, "dae")
+    text = path.read_text(encoding="utf-8")
+    said = re.sub("<up_axis>.*</up_axis>", f"<up_axis>{axis}_UP</up_axis>", text)
+    path.write_text(said, encoding="utf-8")
+    for up in ("y", "z"):
+        assert_same_triangles(load_scene(path, up=up), expected)
+    path.write_text(re.sub("<up_axis>.*</up_axis>", "", text), encoding="utf-8")
+    if axis == "Y":
+        assert_same_triangles(load_scene(path, up="y"), expected)
+
+
 def test_y_up(tmp_path: Path) -> None:
     """A right-handed turn about x: y becomes z and z becomes -y, so that nothing is mirrored."""
     mesh = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3)], [(0, 1, 2), (0, 2, 3), (0, 3, 1), (1, 3, 2)])
@@ -224,7 +253,7 @@ def test_a_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["a.blend", "a", "a.glb.zip", "a.usd"])
 def test_an_unknown_type(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"x")
-    assert "give one of glb, gltf, obj, ply, stl, dae, xml" in refused(tmp_path / name)
+    assert "give one of glb, gltf, obj, ply, stl, dae, xml, ifc" in refused(tmp_path / name)
 
 
 @pytest.mark.parametrize("kind", FILE_TYPES)
