@@ -62,6 +62,15 @@ def _parser() -> argparse.ArgumentParser:
     build.add_argument("-o", "--output", type=Path, required=True, metavar="T.h5")
     build.add_argument("--jobs", type=_jobs, default=-1, help="cells fitted at a time (default: one per core)")
     build.add_argument("--cluster", metavar="ADDRESS", help="let the workers of this Dask scheduler fit the cells")
+    build.add_argument("--former", type=Path, metavar="OLD.h5", help="table to take over from (default: one at T.h5)")
+    build.add_argument(
+        "--tolerance",
+        type=_tolerance,
+        default=0.0,
+        metavar="SHARE",
+        help="also keep cells of the former table whose rays have changed by this share at most, e.g. 0.01; "
+        "the table is then no longer exactly that of a whole build, and says so (default: 0)",
+    )
     build.add_argument("--no-progress", action="store_true", help="show no progress bar")
     build.add_argument("--json", action="store_true", help="print the summary as JSON")
 
@@ -109,6 +118,13 @@ def _jobs(text: str) -> int:
     return jobs
 
 
+def _tolerance(text: str) -> float:
+    tolerance = float(text)
+    if not 0.0 <= tolerance < 1.0:
+        raise argparse.ArgumentTypeError(f"{text} is no share; give 0 or more, below 1, e.g. 0.01")
+    return tolerance
+
+
 def _demo(options: argparse.Namespace) -> int:
     with needs_extra("all"):
         from rayfix.demo import run_demo
@@ -150,7 +166,13 @@ def _build(options: argparse.Namespace) -> int:
 
     with build_progress(enabled=not options.no_progress) as progress:
         summary = build_table(
-            options.site, options.output, jobs=options.jobs, cluster=options.cluster, progress=progress
+            options.site,
+            options.output,
+            jobs=options.jobs,
+            cluster=options.cluster,
+            former=options.former,
+            tolerance=options.tolerance,
+            progress=progress,
         )
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)

@@ -18,6 +18,7 @@ from rich.progress import (
 from rich.table import Table as Grid
 
 from rayfix_tables.table import Table
+from rayfix_tables.update import Update
 
 if TYPE_CHECKING:
     from rayfix_offline.build import BuildSummary
@@ -79,12 +80,21 @@ def print_build_summary(summary: "BuildSummary") -> None:
     )
     console = Console()
     console.print(grid)
+    for s in summary.stations:
+        if s.origin == "updated":
+            console.print(f"{s.station_id}: {_kept(s.num_kept_cells, s.num_cells, s.largest_change)}", highlight=False)
     console.print(
         f"{summary.num_bytes / 1e6:.1f} MB in {summary.seconds:.1f} s, at most {summary.peak_bytes / 1e9:.1f} GB of "
         f"memory; table_id {summary.table_id}",
         highlight=False,
         soft_wrap=True,
     )
+
+
+def _kept(num_kept: int, num_cells: int, largest_change: float) -> str:
+    """Say how many cells were not fitted to this scene, and how far they may be from it."""
+    share = f"{num_kept:,} of {num_cells:,} cells kept"
+    return f"{share}, changed by at most {largest_change:.2%}" if largest_change else f"{share}, all of them exact"
 
 
 def table_info(table: Table) -> dict[str, Any]:
@@ -104,6 +114,7 @@ def table_info(table: Table) -> dict[str, Any]:
                 "position_m": list(part.station.position),
                 "lost_ray_share": part.lost_ray_share,
                 "coverage": list(part.coverage),
+                "update": _update_info(part.update),
                 "levels": [
                     {
                         "window_deg": round(float(np.rad2deg(level.window)), 9),
@@ -115,6 +126,19 @@ def table_info(table: Table) -> dict[str, Any]:
             }
             for station_id, part in table.parts.items()
         ],
+    }
+
+
+def _update_info(update: Update | None) -> dict[str, Any] | None:
+    """Say how far a station may be from a whole build; None when it is what a whole build makes."""
+    if update is None:
+        return None
+    return {
+        "tolerance": update.tolerance,
+        "changed_cells": update.num_changed,
+        "largest_change": update.largest_change,
+        "exact_part_id": update.exact_part_id,
+        "former_part_id": update.former_part_id,
     }
 
 
@@ -140,6 +164,16 @@ def print_table_info(table: Table) -> None:
                 f"{level['components']:,}",
             )
     console.print(grid)
+    for station in facts["stations"]:
+        if station["update"]:
+            cells = sum(level["cells"] for level in station["levels"])
+            update = station["update"]
+            console.print(
+                f"{station['id']}: {_kept(update['changed_cells'], cells, update['largest_change'])} (tolerance "
+                f"{update['tolerance']:.2%}); build without --tolerance to make it exact",
+                highlight=False,
+                soft_wrap=True,
+            )
 
 
 def print_fix(document: Mapping[str, Any]) -> None:

@@ -26,6 +26,8 @@ class FittedCells:
     counts : ndarray of int64, shape (n_cells,)
         Components of each cell.
     log_mass : ndarray of shape (n_cells,)
+    change : ndarray of float32, shape (n_cells,)
+        Bound on the change of the cell's measure since it was fitted, as a share of its mass; 0: fitted to this scene.
     mixture : TubeMixture
         Components of all cells.
     """
@@ -33,18 +35,53 @@ class FittedCells:
     cells: NDArray[np.int64]
     counts: NDArray[np.int64]
     log_mass: NDArray[np.float64]
+    change: NDArray[np.float32]
     mixture: TubeMixture
+
+    @classmethod
+    def of_level(cls, level: Level, cells: NDArray[np.int64], change: NDArray[np.float64]) -> "FittedCells":
+        """Take cells out of a level."""
+        counts = level.cell_offsets[cells + 1] - level.cell_offsets[cells]
+        return cls(
+            cells=cells,
+            counts=counts,
+            log_mass=level.cell_log_mass[cells],
+            change=change.astype(np.float32),
+            mixture=level.mixture[_places(level.cell_offsets[cells], counts)],
+        )
+
+    def joined(self, other: "FittedCells") -> "FittedCells":
+        """Return the cells of both, in ascending order."""
+        cells = np.concatenate([self.cells, other.cells])
+        order = np.argsort(cells)
+        counts = np.concatenate([self.counts, other.counts])
+        starts = np.cumsum(counts) - counts
+        mixture = TubeMixture.concatenate([self.mixture, other.mixture])
+        return FittedCells(
+            cells=cells[order],
+            counts=counts[order],
+            log_mass=np.concatenate([self.log_mass, other.log_mass])[order],
+            change=np.concatenate([self.change, other.change])[order],
+            mixture=mixture[_places(starts[order], counts[order])],
+        )
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a shard."""
         fields = {name: getattr(self.mixture, name) for name in FIELD_SHAPES}
-        return {"cells": self.cells, "counts": self.counts, "log_mass": self.log_mass, **fields}
+        return {"cells": self.cells, "counts": self.counts, "log_mass": self.log_mass, "change": self.change, **fields}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> "FittedCells":
         """Take up what :meth:`to_arrays` gave."""
         mixture = TubeMixture(**{name: arrays[name] for name in FIELD_SHAPES})
-        return cls(cells=arrays["cells"], counts=arrays["counts"], log_mass=arrays["log_mass"], mixture=mixture)
+        columns = {name: arrays[name] for name in ("cells", "counts", "log_mass", "change")}
+        return cls(**columns, mixture=mixture)
+
+
+def _places(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Numbers from each start on, as many as its count, one after another."""
+    ends = np.cumsum(counts)
+    return np.repeat(starts - (ends - counts), counts) + np.arange(counts.sum())
 
 
 def fit_cells(cells: NDArray[np.int64], level: LevelRays, site: SiteFile) -> FittedCells:
@@ -54,7 +91,8 @@ def fit_cells(cells: NDArray[np.int64], level: LevelRays, site: SiteFile) -> Fit
         counts, log_mass, mixture = fit_em(centres, cells, level, ExpectationMaximisation(seed=site.table.seed))
     else:
         counts, log_mass, mixture = fit_tubes(centres, level, TubeFit())
-    return FittedCells(cells=cells, counts=counts, log_mass=log_mass, mixture=mixture)
+    change = np.zeros(len(cells), np.float32)
+    return FittedCells(cells=cells, counts=counts, log_mass=log_mass, change=change, mixture=mixture)
 
 
 def assemble_level(window: float, grid: AngularGrid, parts: Sequence[FittedCells]) -> Level:
@@ -77,3 +115,11 @@ def assemble_level(window: float, grid: AngularGrid, parts: Sequence[FittedCells
         cell_log_mass=log_mass,
         mixture=TubeMixture.concatenate([part.mixture for part in parts]),
     )
+
+
+def assemble_changes(grid: AngularGrid, parts: Sequence[FittedCells]) -> NDArray[np.float32]:
+    """Put the changes of all cells of a level together, shape (n_cells,); 0 for cells that are in no part."""
+    change = np.zeros(grid.num_cells, np.float32)
+    for part in parts:
+        change[part.cells] = part.change
+    return change

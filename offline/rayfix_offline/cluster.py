@@ -107,7 +107,7 @@ class Cluster:
                 (plan.part_id, BUILD_VERSION, plan.station.id),
                 inputs,
                 *arguments,
-                key=f"rayfix-{plan.part_id}-{name}",
+                key=f"rayfix-{plan.part_id}-{name}-{_fingerprint(arguments)}",
                 retries=RETRIES,
             ): name
             for name, (run, arguments) in tasks.items()
@@ -124,6 +124,11 @@ class Cluster:
                 ) from error
             yield futures[future], arrays
             future.release()
+
+
+def _fingerprint(arguments: tuple[Any, ...]) -> str:
+    """Tell tasks of one block apart that fit different cells of it."""
+    return content_key([a.tolist() if isinstance(a, np.ndarray) else a for a in arguments])[:16]
 
 
 def _inputs(site: dict[str, Any], scene: Scene) -> tuple[dict[str, Any], Scene]:

@@ -86,8 +86,9 @@ def sample_points(
     )
     offset = tangent(rays.azimuth[near], rays.zenith[near], centre[0], centre[1])
     square = np.einsum("ij,ij->i", offset, offset) / level.window**2
+    inside = square <= CUTOFF**2
+    near, offset, square = near[inside], offset[inside], square[inside]
     density = np.exp(-0.5 * square) / (2.0 * np.pi * level.window**2) * rays.solid_angle[near]
-    density = np.where(square <= CUTOFF**2, density, 0.0)
     chosen = pieces.of_rays(near)
     ray = np.repeat(np.arange(len(near)), np.diff(chosen.offsets))
     weight = density[ray] * chosen.mass

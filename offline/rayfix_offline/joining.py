@@ -47,6 +47,11 @@ def join_groups(
             first[joined] = i
             joined += 1
         group[i] = joined - 1
+    # In the order in which the groups came, whatever the sequences' numbers: sums then do not depend on them.
+    ranks = np.empty(joined, np.int64)
+    ranks[np.argsort(first[:joined])] = np.arange(joined)
+    group = ranks[group]
+    first = np.sort(first[:joined])
     out_mass = np.zeros(joined)
     out_mean = np.zeros((joined, size))
     out_cov = np.zeros((joined, size, size))
@@ -64,4 +69,4 @@ def join_groups(
             for b in range(size):
                 apart = (mean[i, a] - out_mean[g, a]) * (mean[i, b] - out_mean[g, b])
                 out_cov[g, a, b] += share * (cov[i, a, b] + apart)
-    return surface_sequence[first[:joined]], out_mass, out_mean, out_cov, out_mirror
+    return surface_sequence[first], out_mass, out_mean, out_cov, out_mirror

@@ -42,9 +42,18 @@ class Block:
     cells: NDArray[np.int64]
 
     @property
+    def key(self) -> tuple[int, int]:
+        """Level and number."""
+        return self.level, self.number
+
+    @property
     def shard(self) -> str:
         """Last part of the name of the block's shard."""
         return f"{self.level}-{self.number}"
+
+    def only(self, cells: NDArray[np.int64]) -> "Block":
+        """Return the block with some of its cells only."""
+        return dataclasses.replace(self, cells=cells)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +99,11 @@ def plan_build(site: SiteFile, twin: Twin) -> tuple[StationPlan, ...]:
         )
         for section, station in zip(site.stations, site.info().stations, strict=True)
     )
+
+
+def updated_part_id(exact_part_id: str, former_part_id: str, tolerance: float) -> str:
+    """``part_id`` of a part some of whose cells were kept from a former part though they had changed a little."""
+    return content_key("updated", exact_part_id, former_part_id, tolerance)
 
 
 def _method_settings(site: SiteFile, *, curved: bool) -> dict[str, float | dict[str, float]]:

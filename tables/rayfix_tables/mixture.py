@@ -77,8 +77,8 @@ class TubeMixture:
         """Return the number of components."""
         return len(self.log_weight)
 
-    def __getitem__(self, index: slice) -> "TubeMixture":
-        """Components of a range, without a copy."""
+    def __getitem__(self, index: slice | NDArray[np.int64]) -> "TubeMixture":
+        """Components of a range, without a copy, or those of the given numbers."""
         return TubeMixture(**{name: getattr(self, name)[index] for name in FIELD_SHAPES})
 
     @classmethod

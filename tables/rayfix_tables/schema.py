@@ -30,6 +30,9 @@ LEVEL_DATASETS: dict[str, tuple[type[np.generic], int]] = {
 }
 """Type and number of axes of a level's datasets."""
 
+CELL_CHANGE: tuple[type[np.generic], int] = (np.float32, 1)
+"""Type and number of axes of a level's ``cell_change``, which only updated parts have."""
+
 
 def level_path(station_id: str, level: int) -> str:
     """Path of a level's group in the file."""

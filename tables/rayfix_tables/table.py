@@ -18,6 +18,7 @@ from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 from rayfix_tables.schema import (
+    CELL_CHANGE,
     FORMAT,
     FORMAT_VERSION,
     LEVEL_DATASETS,
@@ -29,6 +30,7 @@ from rayfix_tables.schema import (
     level_path,
 )
 from rayfix_tables.site import SiteInfo, Station
+from rayfix_tables.update import Update
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +42,7 @@ class StationPart:
     lost_ray_share: float
     coverage: tuple[float, ...]
     part_id: str = ""
+    update: Update | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +117,7 @@ class Table:
                 lost_ray_share=float(group.attrs["lost_ray_share"]),
                 coverage=tuple(float(share) for share in group.attrs["coverage"]),
                 part_id=str(group.attrs["part_id"]),
+                update=_read_update(group, levels, mapped),
             )
         return cls(
             path=path,
@@ -230,6 +234,21 @@ def _read_level(group: h5py.Group, mapped: NDArray[np.uint8]) -> Level:
         cell_offsets=arrays["cell_offsets"],
         cell_log_mass=arrays["cell_log_mass"],
         mixture=mixture,
+    )
+
+
+def _read_update(group: h5py.Group, levels: tuple[Level, ...], mapped: NDArray[np.uint8]) -> Update | None:
+    if "exact_part_id" not in group.attrs:
+        return None
+    changes = tuple(_map(group[f"levels/{n}/cell_change"], CELL_CHANGE, mapped) for n in range(len(levels)))
+    for n, (change, level) in enumerate(zip(changes, levels, strict=True)):
+        if len(change) != level.num_cells:
+            raise ValueError(f"{group.name}/levels/{n}/cell_change has {len(change)} entries, not {level.num_cells}")
+    return Update(
+        exact_part_id=str(group.attrs["exact_part_id"]),
+        former_part_id=str(group.attrs["former_part_id"]),
+        tolerance=float(group.attrs["update_tolerance"]),
+        cell_change=changes,
     )
 
 

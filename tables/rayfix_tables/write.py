@@ -27,6 +27,7 @@ from rayfix_tables.schema import (
     level_path,
 )
 from rayfix_tables.site import SiteInfo
+from rayfix_tables.update import Update
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,12 +42,15 @@ class StationContent:
         Share of the free space that is reached with at most 0, 1, 2, ... reflections.
     part_id : str
         Names all that decided the part's content, so that a later build can tell whether it is still right.
+    update : Update, optional
+        Of a part with cells that a whole build would have made slightly differently.
     """
 
     levels: tuple[Level, ...]
     lost_ray_share: float
     coverage: tuple[float, ...]
     part_id: str = ""
+    update: Update | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,6 +189,8 @@ def _write_content(
         group.attrs["coverage"] = np.asarray(content.coverage)
         for n, level in enumerate(content.levels):
             _write_level(file.create_group(level_path(station.id, n)), level)
+        if content.update is not None:
+            _write_update(group, content.update)
     file.attrs["format"] = FORMAT
     file.attrs["format_version"] = FORMAT_VERSION
     file.attrs["software_version"] = software_version
@@ -215,6 +221,14 @@ def _write_level(group: h5py.Group, level: Level) -> None:
     stored = level.mixture.as_stored()
     for name in FIELD_SHAPES:
         _write(group, name, getattr(stored, name))
+
+
+def _write_update(group: h5py.Group, update: Update) -> None:
+    group.attrs["exact_part_id"] = update.exact_part_id
+    group.attrs["former_part_id"] = update.former_part_id
+    group.attrs["update_tolerance"] = update.tolerance
+    for n, change in enumerate(update.cell_change):
+        _write(group[f"levels/{n}"], "cell_change", change.astype(np.float32))
 
 
 def _write(group: h5py.Group, name: str, array: NDArray[Any]) -> h5py.Dataset:

@@ -105,6 +105,37 @@ def test_locate_takes_and_gives_other_formats(
     assert "station 'A1' is no pair; give NAME=STATION" in one_line(err)
 
 
+def test_an_updated_table_says_so(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Closing gaps by a hair: nothing visible changes, but the scene is another one."""
+    run(capsys, "example", tmp_path)
+    site, table = tmp_path / "site.toml", tmp_path / "t.h5"
+    text = site.read_text(encoding="utf-8")
+    text = text.replace("[1.25, 5, 15]", "[15.0]").replace("max_reflections = 3", "max_reflections = 1")
+    site.write_text(text, encoding="utf-8")
+    assert run(capsys, "build", site, "-o", table, "--no-progress")[0] == 0
+    site.write_text(text.replace("reflection_loss_db = 6.0", "reflection_loss_db = 6.01"), encoding="utf-8")
+    status, out, err = run(capsys, "build", site, "-o", table, "--tolerance", "0.05", "--no-progress")
+    assert (status, err) == (0, "")
+    assert re.search(r"bs1: \d+ of \d+ cells kept, changed by at most \d\.\d\d%", out)
+    out = run(capsys, "info", table)[1]
+    assert "(tolerance 5.00%); build without --tolerance to make it exact" in out
+    facts = json.loads(run(capsys, "info", table, "--json")[1])
+    for station in facts["stations"]:
+        assert 0.0 < station["update"]["largest_change"] <= station["update"]["tolerance"] == 0.05
+        assert station["update"]["changed_cells"] > 0
+    summary = json.loads(run(capsys, "build", site, "-o", table, "--no-progress", "--json")[1])
+    assert all(station["largest_change"] == 0.0 for station in summary["stations"])
+    facts = json.loads(run(capsys, "info", table, "--json")[1])
+    assert all(station["update"] is None for station in facts["stations"])
+
+
+@pytest.mark.parametrize("share", ["2", "-0.1", "nan", "much"])
+def test_a_tolerance_that_is_no_share(capsys: pytest.CaptureFixture[str], tmp_path: Path, share: str) -> None:
+    status, _, err = run(capsys, "build", "site.toml", "-o", tmp_path / "t.h5", f"--tolerance={share}")
+    assert status == 2
+    assert "--tolerance" in one_line(err)
+
+
 def test_build_writes_a_table_and_a_summary(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     run(capsys, "example", tmp_path)
     site = tmp_path / "site.toml"

@@ -12,12 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rayfix_tables.errors import CorruptTableError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
 from rayfix_tables.schema import FORMAT_VERSION, array_digest
 from rayfix_tables.site import Station
 from rayfix_tables.table import Table
+from rayfix_tables.update import Update
 
 DEGREES = 1e-14  # relative; angles are stored in degrees
 
@@ -249,3 +251,44 @@ def test_the_id_changes_with_every_part_of_the_content(make_content: Callable[..
         ids[name] = varied.write(tmp_path / "t.h5")
     assert len(set(ids.values())) == len(ids)
     assert len(ids) == 24 + len(FIELD_SHAPES)
+
+
+def with_update(content: Any, seed: int = 0) -> Any:
+    """Content whose first station was updated."""
+    rng = np.random.default_rng(seed)
+    first = content.stations[0]
+    change = tuple((0.01 * rng.random(level.num_cells)).astype(np.float32) for level in first.levels)
+    update = Update(exact_part_id="e" * 64, former_part_id="f" * 64, tolerance=0.01, cell_change=change)
+    return replace(content, stations=(replace(first, update=update), *content.stations[1:]))
+
+
+def test_an_update_is_part_of_the_table(make_content: Callable[..., Any], tmp_path: Path) -> None:
+    content = make_content(5)
+    updated = with_update(content)
+    table_id = updated.write(tmp_path / "updated.h5")
+    table = Table.open(tmp_path / "updated.h5")
+    table.verify()
+    assert_same_table(table, updated)
+    first, second = table.parts.values()
+    assert second.update is None
+    expected = updated.stations[0].update
+    for ours, theirs in zip(first.update.cell_change, expected.cell_change, strict=True):
+        assert_same_bits(ours, theirs)
+    assert replace(first.update, cell_change=()) == replace(expected, cell_change=())
+    assert first.update.largest_change == max(float(change.max()) for change in expected.cell_change)
+    assert table_id == table.table_id
+    assert len({table_id, content.write(tmp_path / "whole.h5"), with_update(content, 1).write(tmp_path / "o.h5")}) == 3
+
+
+@pytest.mark.parametrize("damage", ["missing", "short", "type"])
+def test_a_damaged_update(make_content: Callable[..., Any], tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "updated.h5"
+    with_update(make_content(5)).write(path)
+    with h5py.File(path, "r+") as file:
+        group = file["stations/bs0/levels/1"]
+        change = group["cell_change"][()]
+        del group["cell_change"]
+        if damage != "missing":
+            group["cell_change"] = change[:-1] if damage == "short" else change.astype(np.float64)
+    with pytest.raises(CorruptTableError, match="cell_change"):
+        Table.open(path)
