@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -93,11 +94,34 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     serve.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
     serve.add_argument("--workers", type=int, default=1, help="processes that answer (default: 1)")
+
+    mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: angles of Silicon Labs locators in, positions out")
+    mqtt.add_argument("table", type=Path, metavar="T.h5")
+    mqtt.add_argument("--broker", default="localhost", metavar="HOST[:PORT]", help="(default: localhost)")
+    mqtt.add_argument(
+        "--topic",
+        default="silabs/aoa/angle/+/+",
+        help="angles to read, of topics that end in LOCATOR/TAG (default: silabs/aoa/angle/+/+)",
+    )
+    mqtt.add_argument(
+        "--publish",
+        default="rayfix/position/{target_id}",
+        metavar="TOPIC",
+        help="topic of positions (default: rayfix/position/{target_id})",
+    )
+    _add_output_arguments(mqtt)
+    mqtt.add_argument(
+        "--window", type=float, default=0.5, help="seconds that a packet waits for more locators (default: 0.5)"
+    )
+    mqtt.add_argument("--frame", choices=("lcs", "scene", "north"), default="lcs", help="of the angles (default: lcs)")
+    mqtt.add_argument("--tls", action="store_true", help="encrypt; the port is then 8883 unless given")
+    mqtt.add_argument("--username", help=f"the password is taken from the environment variable {_PASSWORD_VARIABLE}")
     return parser
 
 
 _INPUTS = ("native", "nrppa", "silabs", "ublox")
 _OUTPUTS = ("native", "3gpp", "omlox")
+_PASSWORD_VARIABLE = "RAYFIX_MQTT_PASSWORD"  # not an argument, which other users of the machine could read
 
 
 def _add_output_arguments(command: argparse.ArgumentParser) -> None:
@@ -231,4 +255,27 @@ def _serve(options: argparse.Namespace) -> int:
     with needs_extra("service"):
         from rayfix_service.http.server import serve
     serve(options.table, host=options.host, port=options.port, workers=options.workers)
+    return 0
+
+
+def _mqtt(options: argparse.Namespace) -> int:
+    with needs_extra("mqtt"):
+        from rayfix.mqtt import serve_mqtt
+        from rayfix_service.adapters.adapted import station_map
+        from rayfix_service.adapters.mqtt import MqttSettings, parse_broker
+    broker = parse_broker(
+        options.broker,
+        tls=options.tls,
+        username=options.username,
+        password=os.environ.get(_PASSWORD_VARIABLE),
+    )
+    settings = MqttSettings(
+        topic=options.topic,
+        publish=options.publish,
+        output=options.output,
+        window=options.window,
+        stations=station_map(options.station),
+        frame=options.frame,
+    )
+    serve_mqtt(options.table, broker, settings)
     return 0

@@ -1,0 +1,40 @@
+"""Locate from an MQTT broker until told to end."""
+
+import asyncio
+import logging
+import signal
+from pathlib import Path
+
+from rayfix_service.adapters.mqtt import Broker, MqttSettings, check_settings, run_mqtt
+from rayfix_service.fusion.locator import Locator
+from rayfix_tables.table import Table
+
+
+def serve_mqtt(table_path: Path, broker: Broker, settings: MqttSettings) -> None:
+    """Locate from a broker until the process is told to end (SIGINT, SIGTERM).
+
+    Raises
+    ------
+    TableError
+        When the table is missing, of another format, or damaged.
+    BrokerError
+        When a setting is out of range, or the broker cannot be used.
+    """
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s: %(message)s")
+    check_settings(settings)
+    table = Table.open(table_path)
+    table.verify()
+    locator = Locator(table)
+    locator.warm_up()
+    asyncio.run(_until_told(locator, broker, settings))
+
+
+async def _until_told(locator: Locator, broker: Broker, settings: MqttSettings) -> None:
+    loop = asyncio.get_running_loop()
+    work = asyncio.ensure_future(run_mqtt(locator, broker, settings))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, work.cancel)
+    try:
+        await work
+    except asyncio.CancelledError:
+        logging.getLogger(__name__).info("told to end")

@@ -1,0 +1,213 @@
+"""Locating from an MQTT broker: angles in, positions out. Needs the extra ``rayfix[mqtt]``."""
+
+import asyncio
+import json
+import logging
+import ssl
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass, field
+from time import monotonic, perf_counter
+from typing import Any
+from urllib.parse import urlsplit
+
+import aiomqtt
+
+from rayfix_service.adapters.adapted import Adapted
+from rayfix_service.adapters.formats import OutputFormat, write
+from rayfix_service.adapters.silabs_stream import SilabsStream
+from rayfix_service.fusion.locator import Locator
+from rayfix_service.fusion.report import Frame
+from rayfix_tables.errors import RayfixError, ReportError
+
+_log = logging.getLogger(__name__)
+
+_LONGEST_PAUSE = 30.0  # s, between attempts to connect again
+_MOST_WAITING = 10_000  # messages; when they come faster than fixes are computed, the newest are dropped
+
+
+class BrokerError(RayfixError):
+    """The MQTT broker cannot be used."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Broker:
+    """Where the broker is, and who asks."""
+
+    host: str
+    port: int = 1883
+    username: str | None = None
+    password: str | None = field(default=None, repr=False)
+    tls: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class MqttSettings:
+    """What is read, how it is joined, and what is published.
+
+    Attributes
+    ----------
+    topic : str
+        Topic filter of locators' angles; topics must end in ``<locator>/<tag>``.
+    publish : str
+        Topic of positions; ``{target_id}`` stands for the tag.
+    output : {"native", "3gpp", "omlox"}
+        Format of positions.
+    window : float, s
+        How long a packet waits for more locators.
+    stations : Mapping
+        Stations by locator, for those that are not stations' identifiers.
+    frame : {"lcs", "scene", "north"}
+        Frame of the angles.
+    """
+
+    topic: str = "silabs/aoa/angle/+/+"
+    publish: str = "rayfix/position/{target_id}"
+    output: OutputFormat = "native"
+    window: float = 0.5
+    stations: Mapping[str, str] = field(default_factory=dict)
+    frame: Frame = "lcs"
+
+
+def parse_broker(text: str, *, tls: bool = False, username: str | None = None, password: str | None = None) -> Broker:
+    """Read ``HOST`` or ``HOST:PORT``; the port is 1883, or 8883 with TLS, unless given.
+
+    Raises
+    ------
+    BrokerError
+        For anything else.
+    """
+    try:
+        parts = urlsplit(f"//{text}")
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if not host or parts.path or parts.query or parts.fragment or "@" in text:
+        raise BrokerError(f"broker {text!r} is no address; give HOST or HOST:PORT, e.g. localhost:1883")
+    return Broker(host=host, port=port or (8883 if tls else 1883), username=username, password=password, tls=tls)
+
+
+def check_settings(settings: MqttSettings) -> None:
+    """Check what a broker would refuse or what would loop.
+
+    Raises
+    ------
+    BrokerError
+    """
+    if not 0.0 < settings.window <= 60.0:
+        raise BrokerError(f"window is {settings.window:g}; give more than 0 and at most 60 seconds")
+    try:
+        topic = settings.publish.format(target_id="tag")
+    except (KeyError, IndexError, ValueError):
+        topic = ""
+    if not topic or set(topic) & set("+#"):
+        raise BrokerError(
+            f"topic {settings.publish!r} cannot be published to; give one without + and #, "
+            "and with no placeholder but {target_id}"
+        )
+    try:
+        loops = aiomqtt.Topic(topic).matches(settings.topic)
+    except ValueError:
+        raise BrokerError(f"topic {settings.topic!r} is no topic filter; give e.g. silabs/aoa/angle/+/+") from None
+    if loops:
+        raise BrokerError(f"topic {settings.publish!r} is among those read, {settings.topic!r}; give another")
+
+
+async def run_mqtt(
+    locator: Locator, broker: Broker, settings: MqttSettings, *, on_ready: Callable[[], None] | None = None
+) -> None:
+    """Locate until cancelled; a lost connection is made again, with pauses of 1 to 30 s.
+
+    Parameters
+    ----------
+    locator : Locator
+    broker : Broker
+    settings : MqttSettings
+    on_ready : callable, optional
+        Called each time that the topics are subscribed to.
+
+    Raises
+    ------
+    BrokerError
+        When a setting is out of range, or the first connection fails.
+    """
+    check_settings(settings)
+    stream = SilabsStream(locator.table.site, window=settings.window, stations=settings.stations, frame=settings.frame)
+    place = f"{broker.host}:{broker.port}"
+    connected, pause = False, 1.0
+    while True:
+        try:
+            async with _client(broker) as client:
+                await client.subscribe(settings.topic)
+                connected, pause = True, 1.0
+                _log.info("reading '%s' from %s", settings.topic, place)
+                if on_ready is not None:
+                    on_ready()
+                await _first_of(_read(client, stream, locator, settings), _watch(client, stream, locator, settings))
+        except (aiomqtt.MqttError, OSError) as error:
+            if not connected:
+                text = f"cannot use the MQTT broker {place} ({error}); check its address and your rights"
+                raise BrokerError(text) from error
+            _log.warning("lost the broker %s (%s), trying again in %g s", place, error, pause)
+        await asyncio.sleep(pause)
+        pause = min(2.0 * pause, _LONGEST_PAUSE)
+
+
+def _client(broker: Broker) -> aiomqtt.Client:
+    return aiomqtt.Client(
+        broker.host,
+        port=broker.port,
+        username=broker.username,
+        password=broker.password,
+        tls_context=ssl.create_default_context() if broker.tls else None,
+        max_queued_incoming_messages=_MOST_WAITING,
+    )
+
+
+async def _first_of(*coroutines: Coroutine[Any, Any, None]) -> None:
+    """Run coroutines until the first ends, as a rule with an exception, and cancel the others."""
+    tasks = [asyncio.create_task(coroutine) for coroutine in coroutines]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _read(client: aiomqtt.Client, stream: SilabsStream, locator: Locator, settings: MqttSettings) -> None:
+    async for message in client.messages:
+        if isinstance(message.payload, bytes):
+            reports = stream.receive(message.topic.value, message.payload, monotonic())
+            await _publish(client, reports, locator, settings)
+
+
+async def _watch(client: aiomqtt.Client, stream: SilabsStream, locator: Locator, settings: MqttSettings) -> None:
+    """End packets that not all locators have heard."""
+    while True:
+        await asyncio.sleep(0.1 * settings.window)
+        await _publish(client, stream.due(monotonic()), locator, settings)
+
+
+async def _publish(client: aiomqtt.Client, reports: list[Adapted], locator: Locator, settings: MqttSettings) -> None:
+    for adapted in reports:
+        begin = perf_counter()
+        try:
+            fix = locator.locate(adapted.report)
+            document = write(
+                fix,
+                settings.output,
+                locator.table.site,
+                compute_seconds=perf_counter() - begin,
+                adapted=adapted,
+            )
+        except ReportError as error:
+            _log.info("no position of '%s': %s", adapted.report.target_id, error)
+            continue
+        except Exception:
+            # A defect that one packet meets must not end the service.
+            _log.exception("a packet of '%s' failed", adapted.report.target_id)
+            continue
+        topic = settings.publish.format(target_id=adapted.report.target_id)
+        await client.publish(topic, json.dumps(document))
