@@ -57,3 +57,24 @@ def test_fusion(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monke
     for row in rows:
         ours, _, error, _, theirs = (float(value) for value in row[12:].split()[:5])
         assert min(ours, theirs, error) > 0.0
+
+
+@pytest.mark.slow
+def test_uwb(
+    shared_data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    picture = tmp_path / "uwb.png"
+    arguments = ["--data", str(shared_data / "uwb"), "--reports", "3", "--windows", "15", "--plot", str(picture)]
+    lines = run("uwb.py", capsys, monkeypatch, *arguments)
+    rows = {line[:30].strip(): [float(v) for v in line[30:].split()[:6]] for line in lines[3:]}
+    assert list(rows) == [
+        "least squares",
+        "least squares, one wrong",
+        "same, height known",
+        "same, height known, one wrong",
+        "rayfix 15 deg",
+        "rayfix 15 deg, one wrong",
+    ]
+    # Median horizontal errors of nine fixes; one range of eight is 3 m too long.
+    assert rows["rayfix 15 deg, one wrong"][0] < 0.5 * rows["least squares, one wrong"][0]
+    assert picture.stat().st_size > 10_000
