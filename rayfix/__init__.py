@@ -18,10 +18,26 @@ if TYPE_CHECKING:
     from rayfix.api import build as build
     from rayfix_service.fusion.report import Fix as Fix
     from rayfix_service.fusion.report import Report as Report
+    from rayfix_service.impulse_response import range_from_impulse_response as range_from_impulse_response
+    from rayfix_service.ranging import range_from_round_trip as range_from_round_trip
+    from rayfix_service.ranging import range_from_rssi as range_from_rssi
+    from rayfix_service.ranging import range_from_times as range_from_times
 
 __version__ = software_version()
 
-__all__ = ["Fix", "Locator", "RayfixError", "Report", "Table", "__version__", "build"]
+__all__ = [
+    "Fix",
+    "Locator",
+    "RayfixError",
+    "Report",
+    "Table",
+    "__version__",
+    "build",
+    "range_from_impulse_response",
+    "range_from_round_trip",
+    "range_from_rssi",
+    "range_from_times",
+]
 
 
 def __getattr__(name: str) -> Any:

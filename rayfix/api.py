@@ -10,9 +10,20 @@ from rayfix_tables.table import Table
 with needs_extra("service"):
     from rayfix_service.fusion.locator import Locator as _Locator
     from rayfix_service.fusion.report import Fix, Report
+    from rayfix_service.impulse_response import range_from_impulse_response
+    from rayfix_service.ranging import range_from_round_trip, range_from_rssi, range_from_times
     from rayfix_service.wire import parse_report
 
-__all__ = ["Fix", "Locator", "Report", "build"]
+__all__ = [
+    "Fix",
+    "Locator",
+    "Report",
+    "build",
+    "range_from_impulse_response",
+    "range_from_round_trip",
+    "range_from_rssi",
+    "range_from_times",
+]
 
 
 def build(site_path: str | Path, table_path: str | Path | None = None, *, jobs: int = -1) -> Table:
