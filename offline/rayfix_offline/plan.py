@@ -64,7 +64,7 @@ class StationPlan:
     ----------
     part_id : str
         SHA-256 over all that decides the station's part of the table: scene, free space, propagation, table settings,
-        the station itself and the version of the software's method. Other stations do not count.
+        the station itself but for its bias, and the version of the software's method. Other stations do not count.
     """
 
     section: StationSection
@@ -94,7 +94,7 @@ def plan_build(site: SiteFile, twin: Twin) -> tuple[StationPlan, ...]:
         StationPlan(
             section=section,
             station=station,
-            part_id=content_key(common, section.model_dump(mode="json")),
+            part_id=content_key(common, section.built_from()),
             blocks=_blocks(station, site),
         )
         for section, station in zip(site.stations, site.info().stations, strict=True)

@@ -8,10 +8,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rayfix_tables.errors import SiteError
-from rayfix_tables.site import SiteInfo, Station
+from rayfix_tables.site import SiteInfo, Station, StationBias
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Triple = tuple[Finite, Finite, Finite]
 
 
@@ -57,6 +57,16 @@ class TableSection(_Section):
         return self
 
 
+class BiasSection(_Section):
+    """``[stations.bias]``: what a station measures wrongly each time, measured minus true."""
+
+    range_m: Finite = 0.0
+    range_stdev_m: NotNegative = 0.0
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    zenith_deg: Annotated[float, Field(ge=-90, le=90)] = 0.0
+    angle_stdev_deg: Annotated[float, Field(ge=0, le=90)] = 0.0
+
+
 class StationSection(_Section):
     """``[[stations]]``: one base station, anchor or locator."""
 
@@ -64,6 +74,11 @@ class StationSection(_Section):
     position_m: Triple
     orientation_deg: Triple = (0.0, 0.0, 0.0)
     field_of_view_deg: Annotated[float, Field(gt=0, le=360)] = 360.0
+    bias: BiasSection = BiasSection()
+
+    def built_from(self) -> dict[str, Any]:
+        """Return what the station's part of the table depends on: all but the bias, which the fusion takes off."""
+        return self.model_dump(mode="json", exclude={"bias"})
 
 
 class SiteFile(_Section):
@@ -96,6 +111,13 @@ class SiteFile(_Section):
                     position=s.position_m,
                     orientation=_radians(s.orientation_deg),
                     field_of_view=float(np.deg2rad(s.field_of_view_deg)),
+                    bias=StationBias(
+                        range=s.bias.range_m,
+                        range_stdev=s.bias.range_stdev_m,
+                        azimuth=float(np.deg2rad(s.bias.azimuth_deg)),
+                        zenith=float(np.deg2rad(s.bias.zenith_deg)),
+                        angle_stdev=float(np.deg2rad(s.bias.angle_stdev_deg)),
+                    ),
                 )
                 for s in self.stations
             ),
@@ -164,6 +186,7 @@ def _known_keys(location: tuple[str | int, ...]) -> list[str]:
         "propagation": PropagationSection,
         "table": TableSection,
         "stations": StationSection,
+        "bias": BiasSection,
     }
     for part in location:
         if isinstance(part, str) and part in sections:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
+from rayfix_tables.site import NO_BIAS, StationBias
 
 FORMAT = "rayfix-table"
 FORMAT_VERSION = 1
@@ -37,6 +38,30 @@ CELL_CHANGE: tuple[type[np.generic], int] = (np.float32, 1)
 def level_path(station_id: str, level: int) -> str:
     """Path of a level's group in the file."""
     return f"stations/{station_id}/levels/{level}"
+
+
+def bias_attributes(bias: StationBias) -> dict[str, float]:
+    """Attributes of a station's group that hold its bias."""
+    return {
+        "range_bias_m": bias.range,
+        "range_bias_stdev_m": bias.range_stdev,
+        "azimuth_bias_deg": float(np.rad2deg(bias.azimuth)),
+        "zenith_bias_deg": float(np.rad2deg(bias.zenith)),
+        "angle_bias_stdev_deg": float(np.rad2deg(bias.angle_stdev)),
+    }
+
+
+def read_bias(attributes: Mapping[str, Any]) -> StationBias:
+    """Bias of a station from the attributes of its group; tables without them are of stations without a bias."""
+    metres_and_degrees = [float(attributes.get(name, 0.0)) for name in bias_attributes(NO_BIAS)]
+    azimuth, zenith, angle_stdev = (float(angle) for angle in np.deg2rad(metres_and_degrees[2:]))
+    return StationBias(
+        range=metres_and_degrees[0],
+        range_stdev=metres_and_degrees[1],
+        azimuth=azimuth,
+        zenith=zenith,
+        angle_stdev=angle_stdev,
+    )
 
 
 def array_digest(array: NDArray[Any]) -> str:

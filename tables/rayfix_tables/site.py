@@ -5,6 +5,30 @@ from typing import Any
 
 
 @dataclass(frozen=True, kw_only=True)
+class StationBias:
+    """What a station measures wrongly each time: measured minus true. The fusion takes it off; the table holds for any.
+
+    Attributes
+    ----------
+    range, range_stdev : float, m
+        Of times as lengths (propagation times, times of arrival and their differences), and how uncertain it is.
+    azimuth, zenith : float, rad
+        Of the angles, in the frame in which the station reports them.
+    angle_stdev : float, rad
+        How uncertain either of these two is.
+    """
+
+    range: float = 0.0
+    range_stdev: float = 0.0
+    azimuth: float = 0.0
+    zenith: float = 0.0
+    angle_stdev: float = 0.0
+
+
+NO_BIAS = StationBias()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Station:
     """A base station, anchor or locator.
 
@@ -16,12 +40,14 @@ class Station:
         Bearing, downtilt and slant, as in 3GPP TR 38.901; they turn the scene frame into the station's local one.
     field_of_view : float, rad
         Full opening angle of the cone around the station's local +x axis in which it measures.
+    bias : StationBias
     """
 
     id: str
     position: tuple[float, float, float]
     orientation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     field_of_view: float = 6.283185307179586
+    bias: StationBias = NO_BIAS
 
 
 @dataclass(frozen=True, kw_only=True)

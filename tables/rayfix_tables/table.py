@@ -28,6 +28,7 @@ from rayfix_tables.schema import (
     content_id,
     dataset_paths,
     level_path,
+    read_bias,
 )
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.update import Update
@@ -108,6 +109,7 @@ class Table:
                 position=_triple(group.attrs["position_m"]),
                 orientation=_triple(np.deg2rad(group.attrs["orientation_deg"])),
                 field_of_view=float(np.deg2rad(group.attrs["field_of_view_deg"])),
+                bias=read_bias(group.attrs),
             )
             levels = tuple(_read_level(file[level_path(station_id, n)], mapped) for n in range(len(group["levels"])))
             stations.append(station)

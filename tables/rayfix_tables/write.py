@@ -21,6 +21,7 @@ from rayfix_tables.schema import (
     FORMAT,
     FORMAT_VERSION,
     array_digest,
+    bias_attributes,
     content_attributes,
     content_id,
     dataset_paths,
@@ -184,6 +185,8 @@ def _write_content(
         group.attrs["position_m"] = np.asarray(station.position)
         group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
         group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
+        for name, value in bias_attributes(station.bias).items():
+            group.attrs[name] = value
         group.attrs["part_id"] = content.part_id
         group.attrs["lost_ray_share"] = content.lost_ray_share
         group.attrs["coverage"] = np.asarray(content.coverage)

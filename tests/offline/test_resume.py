@@ -8,12 +8,14 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 
 from rayfix_offline.build import BuildSummary, build_table
 from rayfix_offline.shards import ShardStore
 from rayfix_tables.errors import BuildError
+from rayfix_tables.site import NO_BIAS
 from rayfix_tables.table import Table
 
 SITE = """\
@@ -171,6 +173,22 @@ def test_only_what_changed_is_built_again(tmp_path: Path, whole: BuildSummary) -
     assert origins(added) == {"a": "kept", "b": "built", "c": "kept"}
     assert added.table_id == whole.table_id
     Table.open(table).verify()
+
+
+def test_a_bias_rebuilds_nothing(tmp_path: Path, whole: BuildSummary) -> None:
+    """It is the fusion's; but the answers change, and with them the table's id."""
+    table = tmp_path / "t.h5"
+    table.write_bytes(whole.path.read_bytes())
+    site = write_site(tmp_path, STATIONS)
+    text = site.read_text(encoding="utf-8")
+    site.write_text(text + "bias = { range_m = 0.25, azimuth_deg = 2.0 }\n", encoding="utf-8")
+    biased = build_table(site, table, jobs=1)
+    assert origins(biased) == {"a": "kept", "b": "kept", "c": "kept"}
+    assert biased.table_id != whole.table_id
+    biases = {station.id: station.bias for station in Table.open(table).site.stations}
+    assert (biases["c"].range, biases["c"].azimuth) == (0.25, pytest.approx(np.deg2rad(2.0)))
+    assert biases["a"] == biases["b"] == NO_BIAS
+    assert build_table(write_site(tmp_path, STATIONS), table, jobs=1).table_id == whole.table_id
 
 
 def test_another_scene_or_seed(tmp_path: Path, whole: BuildSummary) -> None:

@@ -38,7 +38,19 @@ def test_the_shortest_site_has_the_documented_defaults() -> None:
         },
         "table": {"windows_deg": [1.25, 5.0, 15.0], "fit": "tubes", "seed": 1},
         "stations": [
-            {"id": "s", "position_m": [1, 2, 3], "orientation_deg": [0, 0, 0], "field_of_view_deg": 360.0},
+            {
+                "id": "s",
+                "position_m": [1, 2, 3],
+                "orientation_deg": [0, 0, 0],
+                "field_of_view_deg": 360.0,
+                "bias": {
+                    "range_m": 0.0,
+                    "range_stdev_m": 0.0,
+                    "azimuth_deg": 0.0,
+                    "zenith_deg": 0.0,
+                    "angle_stdev_deg": 0.0,
+                },
+            },
         ],
     }
 
@@ -46,6 +58,7 @@ def test_the_shortest_site_has_the_documented_defaults() -> None:
 def test_the_table_gets_radians(site_document: Document) -> None:
     document = site_document(site={"north_deg": -30.0})
     document["stations"][0] |= {"orientation_deg": [90, 10, -45], "field_of_view_deg": 120}
+    document["stations"][0]["bias"] = {"range_m": 0.2, "range_stdev_m": 0.1, "azimuth_deg": 18, "angle_stdev_deg": 9}
     site = parse_site(document)
     info = site.info()
     assert info.north == pytest.approx(-np.pi / 6, rel=1e-15)
@@ -55,6 +68,8 @@ def test_the_table_gets_radians(site_document: Document) -> None:
     assert station.position == (3.6, 0.4, 2.6)
     assert station.orientation == pytest.approx((np.pi / 2, np.pi / 18, -np.pi / 4), rel=1e-15)
     assert station.field_of_view == pytest.approx(2 * np.pi / 3, rel=1e-15)
+    assert (station.bias.range, station.bias.range_stdev, station.bias.zenith) == (0.2, 0.1, 0.0)
+    assert (station.bias.azimuth, station.bias.angle_stdev) == pytest.approx((np.pi / 10, np.pi / 20), rel=1e-15)
     assert info.document == site.model_dump(mode="json")
     assert parse_site(info.document) == site
 
@@ -72,7 +87,7 @@ def test_an_unknown_key(site_document: Document, section: str, label: str, sibli
 def test_an_unknown_key_of_a_station(site_document: Document) -> None:
     document = site_document()
     document["stations"].append({"id": "bs2", "position_m": [1, 1, 1], "positon_m": [1, 1, 1]})
-    expected = "id, position_m, orientation_deg, field_of_view_deg"
+    expected = "id, position_m, orientation_deg, field_of_view_deg, bias"
     assert refused(document) == f"unknown key stations[1].positon_m; [stations] knows {expected}"
 
 

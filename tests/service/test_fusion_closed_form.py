@@ -21,11 +21,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import (
+    GAUSSIAN,
+    HEAVY_TAILED,
     Angle,
+    ErrorModel,
     Fix,
+    Height,
+    LogRange,
     Measurement,
     Range,
     Report,
@@ -34,11 +40,12 @@ from rayfix_service.fusion.report import (
 )
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.angles import angles_of, direction
+from rayfix_tables.errors import ReportError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture, pack
-from rayfix_tables.site import SiteInfo, Station
+from rayfix_tables.site import SiteInfo, Station, StationBias
 from rayfix_tables.table import Table
 from rayfix_tables.write import SceneContent, StationContent, write_table
 
@@ -210,39 +217,73 @@ def angle_of(tube: Tube, stdev: tuple[float, float] = (0.02, 0.03)) -> Angle:
     )
 
 
-def oracle(tubes: list[Tube], measurements: Sequence[Measurement]) -> Posterior:
-    """Posterior of a report with one angle and any times per station, by one big Gaussian per outlier pattern."""
+Pattern = tuple[tuple[str, ...], float, Array, Array]
+"""What each station's measurements are, the log evidence of it, and mean and covariance of the position."""
+
+
+def one_gaussian(measurement: Measurement, wide: bool) -> tuple[Measurement, float]:
+    """Measurement of which the error is of the one Gaussian or of the other, and the log probability of that."""
+    assert not isinstance(measurement, LogRange)
+    model = measurement.error_model
+    scale, share = (model.tail_scale, model.tail_share) if wide else (1.0, 1.0 - model.tail_share)
+    if isinstance(measurement, Angle):
+        assert measurement.zenith_stdev is not None
+        azimuth_stdev, zenith_stdev = scale * measurement.azimuth_stdev, scale * measurement.zenith_stdev
+        return replace(measurement, azimuth_stdev=azimuth_stdev, zenith_stdev=zenith_stdev), float(np.log(share))
+    return replace(measurement, stdev=scale * measurement.stdev), float(np.log(share))
+
+
+def total_stdev(measurement: Range | TimeOfArrival) -> float:
+    """Give the standard deviation of the whole error."""
+    model = measurement.error_model
+    return float(np.sqrt(1.0 + model.tail_share * (model.tail_scale**2 - 1.0))) * measurement.stdev
+
+
+def patterns_of(
+    tubes: list[Tube],
+    stated: Sequence[Measurement],
+    measurements: Sequence[Measurement],
+    log_share: float,
+    log_volume: float,
+    height: Height | None,
+) -> list[Pattern]:
+    """All ways in which measurements can be outliers, given which Gaussian each error is of."""
     num = len(tubes)
     arrivals = [m for m in measurements if isinstance(m, TimeOfArrival)]
     places = {tube.station_id: n for n, tube in enumerate(tubes)}
     angles = {places[m.station_id]: m for m in measurements if isinstance(m, Angle)}
     size = 3 + 3 * num + (1 if arrivals else 0)
-    patterns = []
+    patterns: list[Pattern] = []
     for kinds in itertools.product(("good", "late", "bad"), repeat=num):
-        times = [m for m in measurements if isinstance(m, Range | TimeOfArrival)]
-        timed = [[m for m in times if places[m.station_id] == n] for n in range(num)]
+        timed: list[list[Range | TimeOfArrival]] = [[] for _ in tubes]
+        log_any = np.zeros(num)
+        for m, said in zip(measurements, stated, strict=True):
+            if isinstance(m, Range | TimeOfArrival) and isinstance(said, Range | TimeOfArrival):
+                timed[places[m.station_id]].append(m)
+                log_any[places[m.station_id]] -= np.log(MAX_PATH_LENGTH + np.sqrt(2.0 * np.pi) * total_stdev(said))
         if any(kind == "late" and not (timed[n] and n in angles) for n, kind in enumerate(kinds)):
             continue
-        product, log_prior, clock_known = Product(size), 0.0, False
+        product, log_prior, clock_known = Product(size), log_share, False
         state = np.eye(size)
         for n, (tube, kind) in enumerate(zip(tubes, kinds, strict=True)):
-            log_any = -sum(np.log(MAX_PATH_LENGTH + np.sqrt(2.0 * np.pi) * m.stdev) for m in timed[n])
             if kind == "bad":
-                log_prior += np.log(EPSILON) + log_any - (np.log(4.0 * np.pi) if n in angles else 0.0)
+                log_prior += np.log(EPSILON) + log_any[n] - (np.log(4.0 * np.pi) if n in angles else 0.0)
                 product.multiply(state[3 + 3 * n : 6 + 3 * n], np.zeros(3), np.eye(3))
                 continue
             log_prior += tube.log_mass + np.log1p(-EPSILON)
             if n in angles and timed[n]:
-                log_prior += np.log(EPSILON) + log_any if kind == "late" else np.log1p(-EPSILON)
+                log_prior += np.log(EPSILON) + log_any[n] if kind == "late" else np.log1p(-EPSILON)
             u = product.multiply_tube(state, n, tube, angles.get(n))
             for m in timed[n] if kind == "good" else []:
                 clock_known |= isinstance(m, TimeOfArrival)
                 row = u[:1] + (state[-1:] if isinstance(m, TimeOfArrival) else 0.0)
                 product.multiply(row, np.array([m.path_length]), np.array([[m.stdev**2]]))
-        log_prior -= np.log(SIDE**3)
         if all(kind == "bad" for kind in kinds):
-            patterns.append((kinds, log_prior + np.log(SIDE**3), np.full(3, np.nan), np.full((3, 3), np.nan)))
+            patterns.append((kinds, log_prior, np.full(3, np.nan), np.full((3, 3), np.nan)))
             continue
+        log_prior -= log_volume
+        if height is not None:
+            product.multiply(state[2:3], np.array([height.z]), np.array([[height.stdev**2]]))
         if arrivals:
             log_prior -= np.log(MAX_PATH_LENGTH)
             if not clock_known:
@@ -251,6 +292,23 @@ def oracle(tubes: list[Tube], measurements: Sequence[Measurement]) -> Posterior:
                 product.multiply(state[-1:], np.zeros(1), np.eye(1))
         log_integral, mean, cov = product.integral()
         patterns.append((kinds, log_prior + log_integral, mean[:3], cov[:3, :3]))
+    return patterns
+
+
+def oracle(tubes: list[Tube], measurements: Sequence[Measurement], height: Height | None = None) -> Posterior:
+    """Posterior of a report with one angle and any times per station, by one big Gaussian per way errors can be."""
+    log_volume = float(np.log(SIDE**3))
+    if height is not None:
+        inside = np.diff(norm.cdf(ORIGIN[2] + np.array([0.0, SIDE]), height.z, height.stdev))[0]
+        log_volume = float(np.log(SIDE**2 * inside))
+    heavy = [n for n, m in enumerate(measurements) if getattr(m, "error_model", GAUSSIAN) != GAUSSIAN]
+    patterns: list[Pattern] = []
+    for wide in itertools.product((False, True), repeat=len(heavy)):
+        log_share, errors = 0.0, list(measurements)
+        for n, is_wide in zip(heavy, wide, strict=True):
+            errors[n], log_chosen = one_gaussian(measurements[n], is_wide)
+            log_share += log_chosen
+        patterns += patterns_of(tubes, measurements, errors, log_share, log_volume, height)
     logs = np.array([pattern[1] for pattern in patterns])
     log_evidence = float(logs.max() + np.log(np.exp(logs - logs.max()).sum()))
     weight = np.exp(logs - log_evidence)
@@ -258,6 +316,7 @@ def oracle(tubes: list[Tube], measurements: Sequence[Measurement]) -> Posterior:
     share = [(w / (1.0 - lost), p) for w, p in zip(weight, patterns, strict=True) if set(p[0]) != {"bad"}]
     mean = np.asarray(sum(w * p[2] for w, p in share))
     cov = np.asarray(sum(w * (p[3] + np.outer(p[2] - mean, p[2] - mean)) for w, p in share))
+    places = {tube.station_id: n for n, tube in enumerate(tubes)}
     outlier = np.array(
         [
             sum(
@@ -337,6 +396,87 @@ def test_a_fix_of_one_station_equals_its_closed_form(make_table: MakeTable, kind
     assert_equal(fix, oracle([TUBES[2]], measurements))
 
 
+@pytest.mark.parametrize("kind", ["aoa", "aoa+pt", "aoa+toa"])
+@pytest.mark.parametrize("outlier", ["", "b"])
+def test_a_fix_of_heavy_tailed_errors_equals_its_closed_form(make_table: MakeTable, kind: str, outlier: str) -> None:
+    """Angles and times whose errors are each of one of two Gaussians, independently."""
+    models = {Angle: ErrorModel(tail_share=0.15, tail_scale=2.2), Range: ErrorModel(tail_share=0.3, tail_scale=4.0)}
+    measurements = [replace(m, error_model=models.get(type(m), HEAVY_TAILED)) for m in measured(kind, outlier)]
+    measurements = [m for m in measurements if m.station_id != "c"]
+    fix = Locator(make_table(*TUBES), EXACT).locate(report_of(measurements))
+    expected = oracle(TUBES[:2], measurements)
+    assert fix.log_evidence == pytest.approx(expected.log_evidence, abs=1e-5)  # nats
+    assert [outcome.outlier_probability for outcome in fix.outcomes] == pytest.approx(expected.outlier, abs=1e-6)
+    if not outlier:  # otherwise the outlier is a second candidate, of a probability of 0.0004
+        assert_equal(fix, expected)
+    plain = oracle(TUBES[:2], [m for m in measured(kind, outlier) if m.station_id != "c"])
+    assert np.abs(fix.candidates[0].position - plain.mean).max() > 1e-3  # m: it makes a difference
+
+
+@pytest.mark.parametrize("kind", ["aoa", "aoa+pt", "aoa+toa"])
+@pytest.mark.parametrize("height", [Height(z=1.3, stdev=0.2), Height(z=0.9, stdev=0.002), Height(z=1.0, stdev=50.0)])
+def test_a_fix_of_known_height_equals_its_closed_form(make_table: MakeTable, kind: str, height: Height) -> None:
+    measurements = measured(kind)
+    fix = Locator(make_table(*TUBES), EXACT).locate(replace(report_of(measurements), height=height))
+    assert_equal(fix, oracle(TUBES, measurements, height))
+
+
+def test_a_sharp_height_cuts_the_posterior_at_its_plane(make_table: MakeTable) -> None:
+    """The paper's two-dimensional case: the Gaussian over (x, y) given z, by the formula for conditional Gaussians."""
+    never = FusionSettings(outlier_probability=1e-15)
+    locator = Locator(make_table(*TUBES), never)
+    whole = oracle(TUBES, measured("aoa+pt"))
+    z = 1.35
+    flat = locator.locate(replace(report_of(measured("aoa+pt")), height=Height(z=z, stdev=1e-3)))
+    free = locator.locate(report_of(measured("aoa+pt")))
+    mean, cov = free.candidates[0].position, free.candidates[0].covariance
+    slope = cov[:2, 2] / cov[2, 2]
+    expected = mean[:2] + slope * (z - mean[2])
+    np.testing.assert_allclose(flat.candidates[0].position, [*expected, z], rtol=0, atol=1e-4)  # m
+    left = cov[:2, :2] - np.outer(slope, cov[2, :2])
+    np.testing.assert_allclose(flat.candidates[0].covariance[:2, :2], left, rtol=1e-3)
+    assert np.abs(expected - whole.mean[:2]).max() > 1e-3  # m: it makes a difference
+
+
+def test_a_height_out_of_the_building_is_refused(make_table: MakeTable) -> None:
+    locator = Locator(make_table(*TUBES))
+    report = replace(report_of(measured("aoa")), height=Height(z=120.0, stdev=0.5))
+    with pytest.raises(ReportError, match=r"height is 120 m .* from -30.80 to 33.20 m; give a height there") as caught:
+        locator.locate(report)
+    assert caught.value.path == ("height",)
+
+
+def test_a_stated_bias_is_as_none(make_table: MakeTable) -> None:
+    """Measurements with the bias in them, and a table that knows it, against neither."""
+    biases = {
+        "a": StationBias(range=0.3, azimuth=0.02, zenith=-0.015),
+        "b": StationBias(range=-0.2, azimuth=-0.03),
+        "c": StationBias(range=0.15, zenith=0.04),
+    }
+    stations = {n: Station(id=n, position=p, bias=biases[n]) for n, p in POSITIONS.items()}
+    known, plain = make_table(*TUBES, stations=stations), make_table(*TUBES)
+
+    def biased(m: Measurement) -> Measurement:
+        bias = biases[m.station_id]
+        if isinstance(m, Angle):
+            assert m.zenith is not None
+            return replace(m, azimuth=m.azimuth + bias.azimuth, zenith=m.zenith + bias.zenith)
+        if isinstance(m, TimeDifference):
+            reference = biases[m.reference_station_id]
+            return replace(m, length_difference=m.length_difference + bias.range - reference.range)
+        assert not isinstance(m, LogRange)
+        return replace(m, path_length=m.path_length + bias.range)
+
+    for measurements in (measured("aoa+pt+toa"), differences("b")):
+        expected = Locator(plain, EXACT).locate(report_of(measurements))
+        found = Locator(known, EXACT).locate(report_of([biased(m) for m in measurements]))
+        np.testing.assert_allclose(found.candidates[0].position, expected.candidates[0].position, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found.candidates[0].covariance, expected.candidates[0].covariance, rtol=1e-9)
+        assert found.log_evidence == pytest.approx(expected.log_evidence, abs=1e-9)
+        unknown = Locator(plain, EXACT).locate(report_of([biased(m) for m in measurements]))
+        assert np.abs(unknown.candidates[0].position - expected.candidates[0].position).max() > 0.05  # m
+
+
 def test_all_measurements_may_be_outliers_with_the_probability_of_bayes_rule(make_table: MakeTable) -> None:
     """Two hypotheses: the angle is of the tube, of which little is there, or of anywhere."""
     tube = line_of_sight("a", log_mass=4.0)
@@ -380,14 +520,33 @@ def test_the_clock_of_times_of_arrival_does_not_matter(make_table: MakeTable, of
     assert second.log_evidence == pytest.approx(first.log_evidence, abs=1e-9)
 
 
-def test_time_differences_equal_times_of_arrival_whatever_the_reference(make_table: MakeTable) -> None:
+TREES = ["ab ac", "ba bc", "ca cb", "ab bc", "ca ab", "bc ca", "ab bc ca", "ab ba ac bc"]
+"""Differences that connect all stations: stars, chains, and more of them than needed."""
+
+
+@pytest.mark.parametrize("model", [GAUSSIAN, HEAVY_TAILED])
+@pytest.mark.parametrize("tree", TREES)
+def test_any_differences_that_connect_all_arrivals_say_the_same(
+    make_table: MakeTable, tree: str, model: ErrorModel
+) -> None:
+    measurements = [replace(m, error_model=model) if isinstance(m, TimeOfArrival) else m for m in measured("aoa+toa")]
+    arrivals = {m.station_id: m for m in measurements if isinstance(m, TimeOfArrival)}
+    differences = [
+        TimeDifference(
+            station_id=first,
+            reference_station_id=second,
+            length_difference=arrivals[first].path_length - arrivals[second].path_length,
+            stdev=float(np.sqrt(2.0)) * arrivals[first].stdev,
+            error_model=model,
+        )
+        for first, second in tree.split()
+    ]
     locator = Locator(make_table(*TUBES), EXACT)
-    expected = locator.locate(report_of(measured("aoa+toa")))
-    for reference in POSITIONS:
-        fix = locator.locate(report_of(differences(reference)))
-        assert fix.log_evidence == pytest.approx(expected.log_evidence, abs=1e-9)
-        np.testing.assert_allclose(fix.candidates[0].position, expected.candidates[0].position, rtol=0, atol=1e-9)  # m
-        np.testing.assert_allclose(fix.candidates[0].covariance, expected.candidates[0].covariance, rtol=1e-9)
+    expected = locator.locate(report_of(measurements))
+    fix = locator.locate(report_of([m for m in measurements if isinstance(m, Angle)] + differences))
+    assert fix.log_evidence == pytest.approx(expected.log_evidence, abs=1e-8)
+    np.testing.assert_allclose(fix.candidates[0].position, expected.candidates[0].position, rtol=0, atol=1e-8)  # m
+    np.testing.assert_allclose(fix.candidates[0].covariance, expected.candidates[0].covariance, rtol=1e-8)
 
 
 def test_a_reference_that_is_late_spoils_all_its_differences(make_table: MakeTable) -> None:
@@ -421,13 +580,14 @@ def test_time_differences_to_one_reference_are_correlated(make_table: MakeTable)
     assert np.abs(covs[1] - covs[0]).max() > 1e-4  # m2: it makes a difference
 
 
-def test_a_repeated_propagation_time_is_one_of_less_noise(make_table: MakeTable) -> None:
+def test_two_propagation_times_of_a_path_are_their_mean(make_table: MakeTable) -> None:
     never = replace(EXACT, outlier_probability=1e-15)
     locator = Locator(make_table(*TUBES), never)
     once = measured("aoa+pt")
     noisy = [replace(m, stdev=m.stdev * float(np.sqrt(2.0))) if isinstance(m, Range) else m for m in once]
-    twice = noisy + [m for m in noisy if isinstance(m, Range)]
-    expected, fix = locator.locate(report_of(once)), locator.locate(report_of(twice))
+    below = [replace(m, path_length=m.path_length - 0.3) if isinstance(m, Range) else m for m in noisy]
+    above = [replace(m, path_length=m.path_length + 0.3) for m in noisy if isinstance(m, Range)]
+    expected, fix = locator.locate(report_of(once)), locator.locate(report_of(below + above))
     np.testing.assert_allclose(fix.candidates[0].position, expected.candidates[0].position, rtol=0, atol=1e-9)  # m
     np.testing.assert_allclose(fix.candidates[0].covariance, expected.candidates[0].covariance, rtol=1e-9)
 

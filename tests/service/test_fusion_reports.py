@@ -1,17 +1,31 @@
 """Sorting a report: which measurements belong together, frames, fields of view, clocks."""
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from rayfix_service.fusion.directions import in_field_of_view, to_scene, without_bias
 from rayfix_service.fusion.lookup import NO_DIRECTION, Direction
-from rayfix_service.fusion.observations import SortedReport, in_field_of_view, sort_report, to_scene
-from rayfix_service.fusion.report import Angle, Frame, Measurement, Range, Report, TimeDifference, TimeOfArrival
+from rayfix_service.fusion.observations import SortedReport, sort_report
+from rayfix_service.fusion.report import (
+    HEAVY_TAILED,
+    Angle,
+    Frame,
+    LogRange,
+    Measurement,
+    Range,
+    Report,
+    TimeDifference,
+    TimeOfArrival,
+)
 from rayfix_tables.angles import direction, wrap
 from rayfix_tables.errors import ReportError
-from rayfix_tables.site import SiteInfo, Station
+from rayfix_tables.site import SiteInfo, Station, StationBias
 
 ORIGIN = (0.0, 0.0, 0.0)
 SITE = SiteInfo(
@@ -22,6 +36,7 @@ SITE = SiteInfo(
         Station(id="a", position=ORIGIN),
         Station(id="b", position=ORIGIN),
         Station(id="c", position=ORIGIN, orientation=(np.pi / 2, 0.0, 0.0), field_of_view=np.pi / 2),
+        Station(id="d", position=ORIGIN),
     ),
 )
 
@@ -186,7 +201,7 @@ def test_what_lies_outside_the_field_of_view_is_unused_and_the_rest_of_its_path_
     assert first.angle_index is None
     assert first.timing_indices == (2,)
     assert second.angle_index == 1
-    assert [length for length, _ in second.lengths] == [4.0]
+    assert [term.value for (term,) in second.lengths] == [4.0]
 
 
 def test_the_kth_angle_and_the_kth_time_are_one_path() -> None:
@@ -203,8 +218,8 @@ def test_the_kth_angle_and_the_kth_time_are_one_path() -> None:
     first, second = (o for o in found.observations if o.station_id == "a")
     assert (first.angle_index, first.timing_indices) == (2, (0, 5, 6))
     assert (second.angle_index, second.timing_indices) == (4, (3,))
-    assert [length for length, _ in first.lengths] == [3.0, 5.0]
-    assert first.lengths[0][1] == pytest.approx(0.01)
+    assert [term.value for (term,) in first.lengths] == [3.0, 5.0]
+    assert first.lengths[0][0].variance == pytest.approx(0.01)
     assert len(first.readings) == 1
     assert not second.readings
 
@@ -216,23 +231,137 @@ def test_times_of_arrival_are_counted_from_their_middle() -> None:
     assert offsets == {"a": -2.0, "b": 4.0, "c": 0.0}
 
 
+def arrivals_of(found: SortedReport) -> dict[str, tuple[float, float]]:
+    """Offset [m] and variance [m2] of each station's reading of the only clock."""
+    assert found.num_clocks == 1
+    return {o.station_id: (o.readings[0].offset, o.readings[0].variance) for o in found.observations}
+
+
 def test_time_differences_share_the_noise_of_their_reference() -> None:
-    found = sort(tdoa("a", "c", 2.0, 1.0), tdoa("b", "c", 5.0, 2.0), tdoa("a", "b", 1.0))
+    found = sort(tdoa("a", "c", 2.0, 1.0), tdoa("b", "c", 5.0, 2.0))
+    expected = {"a": (0.0, 0.5), "b": (3.0, 3.5), "c": (-2.0, 0.5)}
+    assert arrivals_of(found) == {name: pytest.approx(pair) for name, pair in expected.items()}
+    differences = {o.station_id: o.differences for o in found.observations}
+    assert differences == {"a": (0,), "b": (1,), "c": (0, 1)}
+    assert all(o.timing_indices == () for o in found.observations)
+
+
+@pytest.mark.parametrize(
+    "pairs", [("ab", "bc"), ("ba", "bc"), ("ac", "bc"), ("ab", "ca"), ("ab", "bc", "ca"), ("ab", "ba", "bc", "ac")]
+)
+def test_whichever_differences_tell_how_far_the_arrivals_are_apart(pairs: tuple[str, ...]) -> None:
+    """Three arrivals of one deviation, as chains, stars and loops of differences."""
+    times = {"a": 1.0, "b": 4.0, "c": 2.5}
+    stdev = float(np.sqrt(2.0) * 0.7)
+    found = arrivals_of(sort(*(tdoa(s, r, times[s] - times[r], stdev) for s, r in pairs)))
+    assert {name: variance for name, (_, variance) in found.items()} == pytest.approx(dict.fromkeys("abc", 0.49))
+    for name, (offset, _) in found.items():
+        assert offset - found["a"][0] == pytest.approx(times[name] - times["a"], abs=1e-12)
+
+
+def test_differences_of_unlike_noise_keep_it() -> None:
+    """A chain of two: the middle has half of the lesser variance, the ends have the rest."""
+    found = arrivals_of(sort(tdoa("a", "b", 1.0, 1.0), tdoa("b", "c", 1.0, 2.0)))
+    assert {name: variance for name, (_, variance) in found.items()} == {"a": 0.5, "b": 0.5, "c": 3.5}
+
+
+def test_a_noisy_difference_between_arrivals_known_well_is_not_taken_for_a_better_one() -> None:
+    """A chain of four with a noisy middle: no arrivals have just these deviations, so the ends get more."""
+    chain = (tdoa("a", "b", 1.0, 1.0), tdoa("b", "c", 1.0, 3.0), tdoa("c", "d", 1.0, 1.0))
+    found = arrivals_of(sort(*chain))
+    for (first, second), stated in zip(itertools.pairwise("abcd"), (1.0, 9.0, 1.0), strict=True):
+        assert found[first][1] + found[second][1] >= stated - 1e-12
+
+
+def test_stations_that_no_difference_connects_are_on_clocks_of_their_own() -> None:
+    found = sort(tdoa("a", "b", 1.0), tdoa("c", "d", 7.0))
     assert found.num_clocks == 2
-    readings = {(o.station_id, r.clock): r for o in found.observations for r in o.readings}
-    assert {key: r.variance for key, r in readings.items()} == {
-        ("c", 0): 0.5,
-        ("a", 0): 0.5,
-        ("b", 0): 3.5,
-        ("b", 1): 0.5,
-        ("a", 1): 0.5,
-    }
-    assert readings["a", 0].offset - readings["c", 0].offset == 2.0
-    assert readings["b", 0].offset - readings["c", 0].offset == 5.0
-    assert readings["a", 1].offset - readings["b", 1].offset == 1.0
-    reference = next(o for o in found.observations if o.station_id == "c")
-    assert reference.timing_indices == ()
-    assert reference.reference_of == (0, 1)
+    clocks = {o.station_id: o.readings[0].clock for o in found.observations}
+    assert clocks["a"] == clocks["b"] != clocks["c"] == clocks["d"]
+
+
+def test_differences_that_contradict_each_other_are_refused() -> None:
+    """The second has the wrong sign."""
+    with pytest.raises(ReportError, match=r"contradicts the other .* by 2 m; .* check signs") as caught:
+        sort(tdoa("a", "b", 2.0, 0.1), tdoa("b", "a", 2.0, 0.1), tdoa("c", "a", 1.0, 0.1))
+    assert caught.value.path in (("measurements", 0), ("measurements", 1))
+    with pytest.raises(ReportError, match="contradicts"):
+        sort(tdoa("a", "b", 2.0, 0.1), tdoa("b", "c", 2.0, 0.1), tdoa("a", "c", 1.0, 0.1))
+    assert not sort(tdoa("a", "b", 2.0, 1.0), tdoa("b", "a", 2.0, 1.0)).unused
+
+
+@pytest.mark.parametrize(
+    "twice",
+    [
+        angle("a"),
+        Range(station_id="a", path_length=3.0, stdev=0.5),
+        LogRange(station_id="a", path_length=3.0, log_stdev=0.5),
+        toa("a", 3.0),
+    ],
+)
+def test_a_measurement_sent_twice_is_refused(twice: Measurement) -> None:
+    with pytest.raises(ReportError, match=r"measurements\[2\] says the same as measurements\[0\]") as caught:
+        sort(twice, toa("b", 4.0), twice)
+    assert caught.value.path == ("measurements", 2)
+
+
+def test_two_paths_may_be_of_one_length() -> None:
+    same = Range(station_id="a", path_length=3.0, stdev=0.5)
+    found = sort(angle("a", 0.1), same, angle("a", 0.2), same)
+    assert [len(o.lengths) for o in found.observations] == [1, 1]
+    with pytest.raises(ReportError, match="says the same"):
+        sort(angle("a", 0.1), same, angle("a", 0.2), same, same)
+
+
+def test_many_heavy_tails_of_one_path_are_refused() -> None:
+    heavy = [Range(station_id="a", path_length=float(n), stdev=0.5, error_model=HEAVY_TAILED) for n in range(9)]
+    assert len(sort(*heavy[:8]).observations) == 1
+    with pytest.raises(ReportError, match="too many measurements of one path to station 'a'") as caught:
+        sort(*heavy)
+    assert caught.value.path == ("measurements", 8)
+
+
+def test_a_reference_of_heavy_tailed_differences_has_heavy_tails() -> None:
+    """Unless one of its differences has none."""
+    heavy = [replace(tdoa(name, "c", 1.0), error_model=HEAVY_TAILED) for name in "ab"]
+    assert all(len(o.readings[0].spreads) == 2 for o in sort(*heavy).observations)
+    mixed = {o.station_id: len(o.readings[0].spreads) for o in sort(heavy[0], tdoa("b", "c", 1.0)).observations}
+    assert mixed == {"a": 2, "b": 1, "c": 1}
+
+
+def test_biases_are_taken_off_and_widen_the_noise() -> None:
+    bias = StationBias(range=0.25, range_stdev=0.3, azimuth=0.05, zenith=-0.02, angle_stdev=0.04)
+    site = replace(SITE, stations=(replace(SITE.stations[0], bias=bias), *SITE.stations[1:]))
+    measured = (
+        angle("a"),
+        Range(station_id="a", path_length=3.0, stdev=0.4),
+        LogRange(station_id="a", path_length=3.0, log_stdev=0.2),
+        toa("a", 7.0, 0.4),
+        toa("b", 9.0, 0.4),
+        tdoa("a", "b", 1.0, 1.0),
+    )
+    first, second = sort_report(Report(measurements=measured), site).observations
+    assert first.direction.azimuth == pytest.approx(0.95)
+    assert first.direction.zenith == pytest.approx(1.52)
+    np.testing.assert_allclose(first.direction.cov, np.diag([0.02**2 + 0.04**2, 0.03**2 + 0.04**2]), rtol=1e-12)
+    plain = sort(*measured).observations[0]
+    assert first.lengths[0] == ((0.0, 2.75, plain.lengths[0][0].variance),)
+    assert first.lengths[1] == plain.lengths[1]  # a signal strength knows no clock
+    assert first.length_bias_variance == pytest.approx(0.09)
+    # Of the times of arrival and of the differences.
+    apart = [mine.offset - other.offset for mine, other in zip(first.readings, second.readings, strict=True)]
+    assert apart == pytest.approx([-2.25, 0.75])
+    assert [r.variance for r in first.readings] == pytest.approx([0.16 + 0.09, 0.5 + 0.09])
+    assert [r.variance for r in second.readings] == pytest.approx([0.16, 0.5])
+
+
+def test_a_bias_may_push_a_zenith_over_the_pole() -> None:
+    station = replace(SITE.stations[0], bias=StationBias(zenith=0.05))
+    measured = replace(angle("a", 0.3), zenith=0.02, correlation=0.5)
+    found = without_bias(measured, station)
+    assert found.zenith == pytest.approx(0.03)
+    assert float(wrap(found.azimuth - 0.3)) == pytest.approx(np.pi)
+    assert found.correlation == -0.5
 
 
 @pytest.mark.parametrize("measurements", [(toa("a", 3.0),), (toa("a", 3.0), toa("a", 4.0))])
@@ -261,7 +390,7 @@ def test_a_reference_that_is_far_off_leaves_its_differences_to_each_other() -> N
     found = sort(tdoa("b", "a", 5e4 + 3.0), tdoa("c", "a", 5e4 + 5.0))
     assert not found.unused
     offsets = {o.station_id: o.readings[0].offset for o in found.observations}
-    assert offsets == {"b": 0.0, "c": 2.0}
+    assert offsets == pytest.approx({"b": 0.0, "c": 2.0}, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -275,6 +404,6 @@ def test_a_reference_that_is_far_off_leaves_its_differences_to_each_other() -> N
     ],
 )
 def test_an_unknown_station_is_refused_with_its_place(measurement: Measurement, field: str) -> None:
-    with pytest.raises(ReportError, match="station 'x' is not in the table; it has a, b, c") as caught:
+    with pytest.raises(ReportError, match="station 'x' is not in the table; it has a, b, c, d") as caught:
         sort(angle("a"), measurement)
     assert caught.value.path == ("measurements", 1, field)

@@ -1,6 +1,7 @@
 """Any valid report gets a sound answer."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +11,20 @@ from hypothesis import strategies as st
 
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import (
+    GAUSSIAN,
+    HEAVY_TAILED,
     Angle,
+    ErrorModel,
     Fix,
+    Height,
+    LogRange,
     Measurement,
     Range,
     Report,
     TimeDifference,
     TimeOfArrival,
 )
+from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
 
 STATIONS = ("bs1", "bs2", "bs3", "bs4")
@@ -29,6 +36,8 @@ angle_stdev = st.one_of(st.floats(0.01, 60.0), st.sampled_from([0.01, 1.0, 12.0,
 time_stdev = st.one_of(st.floats(1e-3, 100.0), st.sampled_from([1e-3, 0.5, 100.0]))
 frame = st.sampled_from(["scene", "north", "lcs"])
 
+error_model = st.sampled_from([GAUSSIAN, GAUSSIAN, HEAVY_TAILED, ErrorModel(tail_share=0.5, tail_scale=20.0)])
+
 angle = st.builds(
     Angle,
     station_id=station,
@@ -36,10 +45,17 @@ angle = st.builds(
     zenith=zenith,
     azimuth_stdev=angle_stdev,
     zenith_stdev=angle_stdev,
+    correlation=st.floats(-0.99, 0.99),
     frame=frame,
+    error_model=error_model,
 )
-azimuth_only = st.builds(Angle, station_id=station, azimuth=azimuth, azimuth_stdev=angle_stdev, frame=frame)
-propagation_time = st.builds(Range, station_id=station, path_length=st.floats(0.01, 100.0), stdev=time_stdev)
+azimuth_only = st.builds(
+    Angle, station_id=station, azimuth=azimuth, azimuth_stdev=angle_stdev, frame=frame, error_model=error_model
+)
+propagation_time = st.one_of(
+    st.builds(Range, station_id=station, path_length=st.floats(0.01, 100.0), stdev=time_stdev, error_model=error_model),
+    st.builds(LogRange, station_id=station, path_length=st.floats(0.01, 100.0), log_stdev=st.floats(0.01, 1.5)),
+)
 
 
 @st.composite
@@ -47,7 +63,12 @@ def arrivals(draw: st.DrawFn) -> list[Measurement]:
     """Draw times of arrival of a clock that shows anything; some of them may be far off."""
     clock = draw(st.sampled_from([0.0, 123.4, -1e8, 1e8]))
     return [
-        TimeOfArrival(station_id=name, path_length=clock + draw(st.floats(0.0, 60.0)) + off, stdev=draw(time_stdev))
+        TimeOfArrival(
+            station_id=name,
+            path_length=clock + draw(st.floats(0.0, 60.0)) + off,
+            stdev=draw(time_stdev),
+            error_model=draw(error_model),
+        )
         for name in draw(st.lists(station, max_size=4))
         for off in [draw(st.sampled_from([0.0, 0.0, 0.0, 1e4, -1e8]))]
     ]
@@ -62,18 +83,20 @@ def differences(draw: st.DrawFn) -> list[Measurement]:
             reference_station_id=second,
             length_difference=draw(st.one_of(st.floats(-60.0, 60.0), st.sampled_from([1e4, -1e6]))),
             stdev=draw(time_stdev),
+            error_model=draw(error_model),
         )
         for first, second in pairs
     ]
 
 
 reports = st.builds(
-    lambda *parts: Report(measurements=tuple(m for part in parts for m in part)),
+    lambda *parts: Report(measurements=tuple(m for part in parts[:-1] for m in part), height=parts[-1]),
     st.lists(angle, max_size=5),
     st.lists(azimuth_only, max_size=1),
     st.lists(propagation_time, max_size=4),
     arrivals(),
     differences(),
+    st.none() | st.builds(Height, z=st.floats(-0.5, 3.0), stdev=st.one_of(st.floats(0.2, 10.0), st.just(1e3))),
 )
 
 
@@ -115,7 +138,16 @@ def assert_sound(fix: Fix, report: Report) -> None:
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(report=reports)
 def test_any_report_gets_a_sound_fix(locator: Locator, report: Report) -> None:
-    assert_sound(locator.locate(report), report)
+    """Or is told to contradict or to repeat itself."""
+    try:
+        fix = locator.locate(report)
+    except ReportError as error:
+        refusal = error
+    else:
+        assert_sound(fix, report)
+        return
+    assert re.search("contradicts|says the same|too many measurements", str(refusal))
+    assert refusal.path[0] == "measurements"
 
 
 @pytest.mark.parametrize("stdev_deg", [1e-6, 360.0])

@@ -235,7 +235,9 @@ def test_a_batch_lets_other_requests_in_between(client: Client):
 
 
 def test_a_long_report_lets_other_requests_in_between(client: Client):
-    report = {"measurements": REPORT["measurements"] * 12}
+    angle, *others = REPORT["measurements"]
+    paths = [angle | {"azimuth_deg": angle["azimuth_deg"] + 0.1 * n} for n in range(12)]
+    report = {"measurements": [*paths, *others * 12]}
     answered = client.together(("POST", "/v1/positions", report), ("GET", "/livez", None))
     assert [path for path, _ in answered] == ["/livez", "/v1/positions"]
     assert len(answered[1][1].json()["measurements"]) == 24
@@ -259,6 +261,11 @@ EXTREME: dict[str, list[dict[str, Any]]] = {
     "a clock far off": [AOA] + [TOA | {"station_id": s, "range_m": 1e12} for s in ("bs1", "bs2", "bs3")],
     "one time of arrival": [TOA],
     "an impossible difference": [TDOA | {"range_difference_m": 1e6}],
+    "heavy tails": [
+        AOA | {"error_model": "heavy_tailed", "tail_scale": 20},
+        PT | {"error_model": "heavy_tailed", "tail_share": 0.5},
+    ],
+    "all but wholly correlated": [AOA | {"correlation": 0.999}, AOA | {"station_id": "bs2", "correlation": -0.999}],
     "contradicting angles": [AOA | {"azimuth_deg": azimuth} for azimuth in (-170, -80, 10, 100)],
 }
 
@@ -366,7 +373,7 @@ REFUSED: dict[str, tuple[Any, int, str, list[str]]] = {
         "measurements[0].zenit_deg",
         ["did you mean zenith_deg?"],
     ),
-    "unknown type": (changed(0, type="rssi"), 422, "measurements[0].type", ["'rssi'", "aoa, pt, toa, tdoa"]),
+    "unknown type": (changed(0, type="csi"), 422, "measurements[0].type", ["'csi'", "aoa, pt, toa, tdoa, rssi"]),
     "zenith without stdev": (
         changed(0, "zenith_stdev_deg"),
         422,

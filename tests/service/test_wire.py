@@ -10,9 +10,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rayfix_service.fusion.report import (
+    HEAVY_TAILED,
     Angle,
     Candidate,
+    ErrorModel,
     Fix,
+    Height,
+    LogRange,
     Outcome,
     Range,
     Report,
@@ -46,6 +50,14 @@ TDOA = {
     "range_difference_m": 2.1,
     "stdev_m": 0.7,
 }
+RSSI = {
+    "type": "rssi",
+    "station_id": "bs1",
+    "rssi_dbm": -61.0,
+    "power_at_1m_dbm": -42.0,
+    "path_loss_exponent": 2.0,
+    "shadowing_stdev_db": 4.0,
+}
 
 
 def changed(measurement: dict[str, Any], *without: str, **values: Any) -> dict[str, Any]:
@@ -66,9 +78,11 @@ def test_every_kind_of_measurement_comes_across():
     document = {
         "target_id": "agv-7",
         "timestamp": "2026-01-31T10:00:00.250Z",
+        "height": {"z_m": 1.2, "stdev_m": 0.1},
         "measurements": [
-            {**AOA, "azimuth_deg": 90, "zenith_deg": 180, "zenith_stdev_deg": 2, "frame": "lcs"},
-            PT,
+            {**AOA, "azimuth_deg": 90, "zenith_deg": 180, "zenith_stdev_deg": 2, "frame": "lcs", "correlation": -0.5},
+            {**PT, "error_model": "heavy_tailed"},
+            RSSI,
             TOA,
             TDOA,
         ],
@@ -76,6 +90,7 @@ def test_every_kind_of_measurement_comes_across():
     expected = Report(
         target_id="agv-7",
         timestamp="2026-01-31T10:00:00.250Z",
+        height=Height(z=1.2, stdev=0.1),
         measurements=(
             Angle(
                 station_id="bs1",
@@ -84,14 +99,39 @@ def test_every_kind_of_measurement_comes_across():
                 zenith=math.pi,
                 zenith_stdev=math.pi / 90,
                 frame="lcs",
+                correlation=-0.5,
             ),
-            Range(station_id="bs1", path_length=7.9, stdev=0.5),
+            Range(station_id="bs1", path_length=7.9, stdev=0.5, error_model=HEAVY_TAILED),
+            LogRange(station_id="bs1", path_length=math.exp(19 * math.log(10) / 20), log_stdev=math.log(10) / 20 * 4),
             TimeOfArrival(station_id="bs2", path_length=131.0, stdev=0.5),
             TimeDifference(station_id="bs3", reference_station_id="bs1", length_difference=2.1, stdev=0.7),
         ),
     )
     assert parse_report(document) == expected
     assert parse_report(json.dumps(document).encode()) == expected
+
+
+@pytest.mark.parametrize(
+    ("form", "length", "stdev"),
+    [
+        ({"toa_ns": 9e11 + 40.0, "tod_ns": 9e11, "stdev_ns": 2.0}, 40e-9 * SPEED_OF_LIGHT, 2e-9 * SPEED_OF_LIGHT),
+        ({"round_trip_ns": 1280.0, "reply_ns": 1200.0, "stdev_ns": 2.0}, 40e-9 * SPEED_OF_LIGHT, 1e-9 * SPEED_OF_LIGHT),
+        ({"round_trip_ns": 80, "reply_ns": 0, "stdev_ns": 2}, 40e-9 * SPEED_OF_LIGHT, 1e-9 * SPEED_OF_LIGHT),
+    ],
+)
+def test_propagation_times_come_as_the_times_that_were_measured(form: dict[str, float], length: float, stdev: float):
+    measurement = only(changed(PT, "range_m", "stdev_m", **form))
+    assert measurement.path_length == pytest.approx(length, abs=1e-4)  # what is left of 1e12 ns
+    assert measurement.stdev == pytest.approx(stdev)
+
+
+@pytest.mark.parametrize("base", ["AOA", "PT", "TOA", "TDOA"])
+def test_every_kind_but_a_power_may_have_heavy_tails(base: str):
+    document = {"AOA": AOA, "PT": PT, "TOA": TOA, "TDOA": TDOA}[base]
+    assert only(changed(document, error_model="heavy_tailed")).error_model == HEAVY_TAILED
+    found = only(changed(document, error_model="heavy_tailed", tail_share=0.3, tail_scale=5)).error_model
+    assert found == ErrorModel(tail_share=0.3, tail_scale=5.0)
+    assert only(changed(document, error_model="gaussian")) == only(changed(document))
 
 
 def test_what_may_be_left_out():
@@ -220,8 +260,8 @@ BAD: dict[str, tuple[Any, tuple[str | int, ...], list[str]]] = {
     "too many": ({"measurements": [PT] * 257}, ("measurements",), ["length 257", "1 to 256"]),
     "measurements object": ({"measurements": AOA}, ("measurements",), ["an object", "give an array"]),
     "measurement text": ({"measurements": ["x"]}, M0, ["'x'", "JSON object"]),
-    "no type": (changed(AOA, "type"), (*M0, "type"), ["missing", "aoa, pt, toa, tdoa"]),
-    "unknown type": (changed(AOA, type="rssi"), (*M0, "type"), ["'rssi'", "aoa, pt, toa, tdoa"]),
+    "no type": (changed(AOA, "type"), (*M0, "type"), ["missing", "aoa, pt, toa, tdoa, rssi"]),
+    "unknown type": (changed(AOA, type="csi"), (*M0, "type"), ["'csi'", "aoa, pt, toa, tdoa"]),
     "type number": (changed(AOA, type=7), (*M0, "type"), ["7", "aoa, pt, toa, tdoa"]),
     "type array": (changed(AOA, type=["aoa"]), (*M0, "type"), ["array", "aoa, pt, toa, tdoa"]),
     "azimuth 720": (changed(AOA, azimuth_deg=720), (*M0, "azimuth_deg"), ["720", "-180 to 360", "360 off"]),
@@ -260,7 +300,7 @@ BAD: dict[str, tuple[Any, tuple[str | int, ...], list[str]]] = {
         (*M0, "azimut_deg"),
         ["unknown key", "did you mean azimuth_deg?"],
     ),
-    "unknown key": (changed(PT, rssi=-60), (*M0, "rssi"), ["unknown key", "leave it out", "range_m"]),
+    "unknown key": (changed(PT, colour=-60), (*M0, "colour"), ["unknown key", "leave it out", "range_m"]),
     "unknown key of the report": ({"measurements": [PT], "x": 1}, ("x",), ["unknown key", "target_id"]),
     "key that is no text": ({"measurements": [PT], 1: 1}, (1,), ["unknown key"]),
     "station empty": (changed(PT, station_id=""), (*M0, "station_id"), ["''", "1 to 128 characters"]),
@@ -284,6 +324,63 @@ BAD: dict[str, tuple[Any, tuple[str | int, ...], list[str]]] = {
     ),
     "target number": ({"measurements": [PT], "target_id": 7}, ("target_id",), ["is 7;", "your name"]),
     "target long": ({"measurements": [PT], "target_id": "x" * 257}, ("target_id",), ["256 characters"]),
+    "arrival without departure": (
+        changed(PT, "range_m", "stdev_m", toa_ns=1, stdev_ns=1),
+        M0,
+        ["has toa_ns", "tod_ns"],
+    ),
+    "round trip without reply": (
+        changed(PT, "range_m", "stdev_m", round_trip_ns=1, stdev_ns=1),
+        M0,
+        ["has round_trip_ns", "reply_ns"],
+    ),
+    "times of two clocks": (
+        changed(PT, "range_m", "stdev_m", toa_ns=1e9, tod_ns=0, stdev_ns=1),
+        M0,
+        ["3e+08 m", "one clock"],
+    ),
+    "negative reply": (
+        changed(PT, "range_m", "stdev_m", round_trip_ns=1, reply_ns=-1, stdev_ns=1),
+        (*M0, "reply_ns"),
+        ["-1", "0 to 1e+12"],
+    ),
+    "correlation of 1": (
+        changed(AOA, zenith_deg=90, zenith_stdev_deg=1, correlation=1),
+        (*M0, "correlation"),
+        ["-0.999 to 0.999"],
+    ),
+    "correlation without zenith": (changed(AOA, correlation=0.5), (*M0, "zenith_deg"), ["missing", "correlation"]),
+    "unknown error model": (changed(PT, error_model="student"), (*M0, "error_model"), ["'student'", "heavy_tailed"]),
+    "tails of a Gaussian": (changed(TOA, tail_share=0.1), (*M0, "tail_share"), ["heavy_tailed", "leave it out"]),
+    "tails that are none": (
+        changed(TDOA, error_model="heavy_tailed", tail_scale=1.0),
+        (*M0, "tail_scale"),
+        ["1.0", "1.5 to 20"],
+    ),
+    "more tail than middle": (
+        changed(AOA, error_model="heavy_tailed", tail_share=0.6),
+        (*M0, "tail_share"),
+        ["0.6", "0.001 to 0.5"],
+    ),
+    "rssi without model": (changed(RSSI, "path_loss_exponent"), (*M0, "path_loss_exponent"), ["missing", "0.5 to 10"]),
+    "rssi of the next town": (changed(RSSI, rssi_dbm=-190), (*M0, "rssi_dbm"), ["check power_at_1m_dbm"]),
+    "rssi of any distance": (
+        changed(RSSI, shadowing_stdev_db=14.9),
+        (*M0, "shadowing_stdev_db"),
+        ["leaves the distance open"],
+    ),
+    "height of 20 km": ({"measurements": [PT], "height": {"z_m": 2e4, "stdev_m": 1}}, ("height", "z_m"), ["20000"]),
+    "height without stdev": (
+        {"measurements": [PT], "height": {"z_m": 1}},
+        ("height", "stdev_m"),
+        ["missing", "positive"],
+    ),
+    "height alone": ({"measurements": [PT], "height": 1.2}, ("height",), ["1.2", "z_m", "stdev_m"]),
+    "height misspelt": (
+        {"measurements": [PT], "height": {"z": 1, "stdev_m": 1}},
+        ("height", "z"),
+        ["unknown key", "z_m"],
+    ),
     "a Python object": (changed(PT, range_m=1j), (*M0, "range_m"), ["complex", "metres"]),
 }
 
@@ -360,17 +457,23 @@ JSON_VALUES = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
     max_leaves=8,
 )
-KEYS = sorted({*AOA, *PT, *TDOA, "zenith_deg", "zenith_stdev_deg", "frame", "delay_ns", "stdev_ns"})
-NEAR_VALUES = st.sampled_from(["aoa", "pt", "toa", "tdoa", "bs1", "bs2", "lcs", 1, 0.5, -1, 1e300]) | JSON_VALUES
+KEYS = sorted(
+    {*AOA, *PT, *TDOA, *RSSI, "zenith_deg", "zenith_stdev_deg", "frame", "delay_ns", "stdev_ns", "toa_ns", "tod_ns"}
+    | {"round_trip_ns", "reply_ns", "correlation", "error_model", "tail_share", "tail_scale"}
+)
+NEAR_VALUES = (
+    st.sampled_from(["aoa", "pt", "toa", "tdoa", "rssi", "heavy_tailed", "bs1", "bs2", "lcs", 1, 0.5, -1, 1e12, 1e300])
+    | JSON_VALUES
+)
 NEAR_MEASUREMENTS = st.builds(
     lambda base, change: {**base, **change},
-    st.sampled_from([AOA, PT, TOA, TDOA, {}]),
+    st.sampled_from([AOA, PT, TOA, TDOA, RSSI, {}]),
     st.dictionaries(st.sampled_from(KEYS), NEAR_VALUES, max_size=3),
 )
 NEAR_REPORTS = st.builds(
     lambda measurements, rest: {**rest, "measurements": measurements},
     st.lists(NEAR_MEASUREMENTS | JSON_VALUES, max_size=3),
-    st.dictionaries(st.sampled_from(["target_id", "timestamp", "x"]), NEAR_VALUES, max_size=2),
+    st.dictionaries(st.sampled_from(["target_id", "timestamp", "height", "x"]), NEAR_VALUES, max_size=2),
 )
 
 
@@ -387,7 +490,7 @@ def refuse_cleanly(document: Any) -> None:
         assert 1 <= len(report.measurements) <= MAX_MEASUREMENTS
         for measurement in report.measurements:
             for value in vars(measurement).values():
-                assert value is None or isinstance(value, str) or math.isfinite(value)
+                assert value is None or isinstance(value, str | ErrorModel) or math.isfinite(value)
 
 
 @given(JSON_VALUES | NEAR_REPORTS)

@@ -11,7 +11,7 @@ from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
-from rayfix_tables.site import SiteInfo, Station
+from rayfix_tables.site import SiteInfo, Station, StationBias
 from rayfix_tables.write import SceneContent, StationContent, write_table
 
 
@@ -50,6 +50,13 @@ def random_content(
                 position=tuple(rng.uniform(-9, 9, 3).tolist()),
                 orientation=tuple(rng.uniform(-3, 3, 3).tolist()),
                 field_of_view=rng.uniform(0.5, 6.0),
+                bias=StationBias(
+                    range=rng.normal(),
+                    range_stdev=rng.random(),
+                    azimuth=rng.normal(),
+                    zenith=rng.normal(),
+                    angle_stdev=rng.random(),
+                ),
             )
         )
         levels = []

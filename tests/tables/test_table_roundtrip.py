@@ -17,7 +17,7 @@ from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
 from rayfix_tables.schema import FORMAT_VERSION, array_digest
-from rayfix_tables.site import Station
+from rayfix_tables.site import NO_BIAS, Station
 from rayfix_tables.table import Table
 from rayfix_tables.update import Update
 
@@ -43,6 +43,7 @@ def assert_same_table(table: Table, content: Any) -> None:
         assert part.station.position == station.position
         assert part.station.orientation == pytest.approx(station.orientation, rel=DEGREES)
         assert part.station.field_of_view == pytest.approx(station.field_of_view, rel=DEGREES)
+        assert vars(part.station.bias) == pytest.approx(vars(station.bias), rel=DEGREES)
         assert (part.lost_ray_share, part.coverage) == (written.lost_ray_share, written.coverage)
         assert table.levels(station.id) is part.levels
         for level, expected in zip(part.levels, written.levels, strict=True):
@@ -128,6 +129,16 @@ def test_a_cell_is_its_slice_of_the_components(make_content: Callable[..., Any],
     assert 0 in counts
     joined = np.concatenate([level.cell(i).u_mean for i in range(level.num_cells)])
     assert_same_bits(joined, written.mixture.u_mean)
+
+
+def test_a_table_written_before_there_were_biases_has_none(small_table_path: Path, tmp_path: Path) -> None:
+    path = tmp_path / "former.h5"
+    path.write_bytes(small_table_path.read_bytes())
+    with h5py.File(path, "r+") as file:
+        for group in file["stations"].values():
+            for name in [name for name in group.attrs if "bias" in name]:
+                del group.attrs[name]
+    assert all(station.bias == NO_BIAS for station in Table.open(path).site.stations)
 
 
 def test_arrays_are_mapped_and_cannot_be_written(small_table_path: Path) -> None:
@@ -222,6 +233,7 @@ def variations(content: Any) -> dict[str, Any]:
         "position": with_station(position=(x, y, z * near)),
         "orientation": with_station(orientation=(0.1, 0.2, 0.3)),
         "field_of_view": with_station(field_of_view=station.field_of_view * near),
+        "bias": with_station(bias=replace(station.bias, range=station.bias.range * near)),
         "lost_ray_share": with_part(lost_ray_share=first.lost_ray_share * near),
         "coverage": with_part(coverage=(*first.coverage[:-1], first.coverage[-1] * near)),
         "no coarse level": with_part(levels=(level,)),
@@ -250,7 +262,7 @@ def test_the_id_changes_with_every_part_of_the_content(make_content: Callable[..
     for name, varied in variations(content).items():
         ids[name] = varied.write(tmp_path / "t.h5")
     assert len(set(ids.values())) == len(ids)
-    assert len(ids) == 24 + len(FIELD_SHAPES)
+    assert len(ids) == 25 + len(FIELD_SHAPES)
 
 
 def with_update(content: Any, seed: int = 0) -> Any:

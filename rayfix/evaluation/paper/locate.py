@@ -10,8 +10,8 @@ from rayfix.evaluation.paper.algorithms import PaperSettings, algorithm_1, algor
 from rayfix.evaluation.paper.mixtures import Mixture, arg_max, multiply
 from rayfix.evaluation.paper.points import Launcher, RayPoints, draw_directions, points_on_rays
 from rayfix.evaluation.paper.selection import RelativeLength
+from rayfix_service.fusion.directions import to_scene
 from rayfix_service.fusion.lookup import NO_DIRECTION, Direction
-from rayfix_service.fusion.observations import to_scene
 from rayfix_service.fusion.report import Angle, Range, Report, TimeDifference, TimeOfArrival
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo
@@ -104,6 +104,8 @@ def _sorted(
         elif isinstance(measurement, TimeDifference):
             references.add(measurement.reference_station_id)
             differences[name] = RelativeLength(length_difference=measurement.length_difference, stdev=measurement.stdev)
+        else:
+            raise ReportError(f"the paper's method knows no {type(measurement).__name__}", path=("measurements",))
     if len(arrivals) > 1:
         first, (start, start_stdev) = next(iter(arrivals.items()))
         references.add(first)

@@ -9,7 +9,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from rayfix_service.wire import FieldProblem, InvalidReportError, WireModel, path_text, read_json
-from rayfix_service.wire.documents import MISFIT, Rfc3339
+from rayfix_service.wire.fields import MISFIT, Rfc3339
 from rayfix_service.wire.problems import Path, shown
 
 _MAX_PROBLEMS = 50

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.factors import ALL_OUTLIER, Factor
 from rayfix_service.fusion.kernels import extend_beam
+from rayfix_service.fusion.prior import Prior
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +39,7 @@ class Hypotheses:
 
 
 def multiply(
-    factors: Sequence[Factor], *, num_clocks: int, max_path_length: float, log_volume: float, width: int
+    factors: Sequence[Factor], *, num_clocks: int, max_path_length: float, prior: Prior, width: int
 ) -> Hypotheses:
     """Find the most probable products of one alternative of each factor.
 
@@ -48,6 +49,8 @@ def multiply(
         At least one.
     max_path_length : float, m
         What the prior density of a clock's offset is the inverse of, wherever the offset is.
+    prior : Prior
+        Of the position.
     width : int
         Hypotheses that are kept after each factor.
     """
@@ -55,7 +58,8 @@ def multiply(
     log_range = float(np.log(max_path_length))
     information = np.zeros((1, dimension, dimension))
     eta = np.zeros((1, dimension))
-    log_scale = np.full(1, -num_clocks * log_range - log_volume)
+    information[0, 2, 2], eta[0, 2] = prior.precision, prior.eta
+    log_scale = np.full(1, -num_clocks * log_range - prior.log_volume)
     chosen = np.zeros((1, len(factors)), np.int8)
     score = np.zeros(1)
     # Few alternatives first: they cut the beam before it meets the many. Which of two alike comes first must not
@@ -70,7 +74,7 @@ def multiply(
             factor.eta,
             factor.log_scale,
             width,
-            log_volume,
+            prior.log_volume,
             log_range,
         )
         information = information[parent] + factor.information[choice]

@@ -1,15 +1,20 @@
 """Turn an observation into a factor: alternatives for what the measured path may be."""
 
+import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_service.fusion.clocks import ClockReading
 from rayfix_service.fusion.kernels import condition_on_angle, condition_on_length, to_information
-from rayfix_service.fusion.lookup import Lookup, look_up
-from rayfix_service.fusion.observations import ClockReading, Observation
+from rayfix_service.fusion.likelihood import Term, product, total_variance
+from rayfix_service.fusion.lookup import Direction, Lookup, look_up
+from rayfix_service.fusion.observations import Observation
+from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.table import StationPart
 
@@ -46,7 +51,7 @@ def make_factor(
     *,
     num_clocks: int,
     max_path_length: float,
-    log_volume: float,
+    prior: Prior,
     settings: FusionSettings,
 ) -> Factor | None:
     """Alternatives of one observation, or None where no ray of the table comes.
@@ -55,33 +60,32 @@ def make_factor(
     ----------
     max_path_length : float, m
         A time that is an outlier may be anything up to this, and noise.
-    log_volume : float
-        Natural logarithm of the free space's volume [m3].
+    prior : Prior
+        Not part of the factor, but of the judgement which alternatives are worth keeping.
     """
-    log_evidence, mean, cov = _condition(look_up(part.levels, observation.direction))
-    if not len(log_evidence):
-        return None
-    readings = observation.readings
-    variances = [*(variance for _, variance in observation.lengths), *(r.variance for r in readings)]
     # Noise counts, so that a measurement with very much of it does not look like an outlier.
-    log_any_time = -sum(math.log(max_path_length + math.sqrt(2.0 * math.pi * v)) for v in variances)
+    log_any_time = -sum(math.log(max_path_length + math.sqrt(2.0 * math.pi * v)) for v in _variances(observation))
     log_good, log_bad = math.log1p(-settings.outlier_probability), math.log(settings.outlier_probability)
     log_outlier = log_bad + log_any_time - _log_angle_range(observation)
-    # Readings are not in the evidence yet; what each clock will cost, whatever it shows, is its even prior.
-    log_clocks = -len({reading.clock for reading in readings}) * math.log(max_path_length)
-    parts = []
-    if observation.angle_index is not None and variances:
-        parts.append(_Part(TIME_OUTLIER, log_evidence + (log_good + log_bad + log_any_time), mean, cov, 0.0))
-        log_evidence, mean, cov = log_evidence + 2.0 * log_good, mean.copy(), cov.copy()
-    else:
-        log_evidence += log_good
-    for length, variance in observation.lengths:
-        condition_on_length(log_evidence, mean, cov, length, variance)
-    parts.insert(0, _Part(ALL_GOOD, log_evidence, mean, cov, log_clocks))
-    top = max(log_outlier + log_volume, *(float(part.log_evidence.max()) + part.log_clocks for part in parts))
+    timed = bool(observation.lengths or observation.readings)
+    parts: list[_Part] = []
+    for log_spread, scale in observation.angle_spreads:
+        log_evidence, mean, cov = _condition(look_up(part.levels, _widened(observation.direction, scale)))
+        if not len(log_evidence):
+            continue
+        log_evidence += log_good + log_spread
+        if observation.angle_index is None or not timed:
+            parts += _good_parts(log_evidence, mean, cov, observation, max_path_length)
+            continue
+        parts += _good_parts(log_evidence + log_good, mean.copy(), cov.copy(), observation, max_path_length)
+        parts.append(_Part(TIME_OUTLIER, log_evidence + (log_bad + log_any_time), mean, cov, (), 0.0))
+    if not parts:
+        return None
+    parts.sort(key=lambda part: part.kind)
+    scores = [p.log_evidence + p.log_clocks + prior.log_gain(p.mean, p.cov) for p in parts]
+    top = max(log_outlier + prior.log_volume, *(float(score.max()) for score in scores))
     floor = top + math.log(settings.component_floor)
-    keeps = [np.flatnonzero(part.log_evidence + part.log_clocks > floor) for part in parts]
-    return _alternatives(parts, keeps, readings, log_outlier, 3 + num_clocks)
+    return _alternatives(parts, [np.flatnonzero(score > floor) for score in scores], log_outlier, 3 + num_clocks)
 
 
 class _Part(NamedTuple):
@@ -91,13 +95,70 @@ class _Part(NamedTuple):
     log_evidence: NDArray[np.float64]
     mean: NDArray[np.float64]
     cov: NDArray[np.float64]
+    readings: tuple[ClockReading, ...]
     log_clocks: float
+
+
+def _good_parts(
+    log_evidence: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    cov: NDArray[np.float64],
+    observation: Observation,
+    max_path_length: float,
+) -> Iterator[_Part]:
+    """Alternatives for which all times are what they seem, of each combination of the Gaussians of their errors.
+
+    The arrays may be overwritten.
+    """
+    combinations = list(itertools.product(_joint_lengths(observation), _joint_readings(observation.readings)))
+    # Readings are not in the evidence yet; what each clock will cost, whatever it shows, is its even prior.
+    log_clocks = -len({reading.clock for reading in observation.readings}) * math.log(max_path_length)
+    for n, (length, (log_weight, readings)) in enumerate(combinations, start=1):
+        last = n == len(combinations)
+        own = (log_evidence, mean, cov) if last else (log_evidence.copy(), mean.copy(), cov.copy())
+        if length is not None:
+            condition_on_length(*own, length.value, length.variance)
+            log_weight += length.log_weight
+        own[0][:] += log_weight
+        yield _Part(ALL_GOOD, *own, readings, log_clocks)
+
+
+def _joint_lengths(observation: Observation) -> list[Term | None]:
+    """Gaussians over the path length that all measured lengths together make."""
+    if not observation.lengths:
+        return [None]
+    return [product(terms, observation.length_bias_variance) for terms in itertools.product(*observation.lengths)]
+
+
+def _joint_readings(readings: tuple[ClockReading, ...]) -> list[tuple[float, tuple[ClockReading, ...]]]:
+    """Combine the Gaussians that readings may be of, each with the logarithm of their probability."""
+    combinations = itertools.product(*(reading.spreads for reading in readings))
+    return [
+        (
+            sum(spread.log_weight for spread in spreads),
+            tuple(replace(r, variance=r.variance * s.scale**2) for r, s in zip(readings, spreads, strict=True)),
+        )
+        for spreads in combinations
+    ]
+
+
+def _variances(observation: Observation) -> list[float]:
+    """Variance of each time of an observation, m2, whichever Gaussian it is of."""
+    lengths = [total_variance(terms) + observation.length_bias_variance for terms in observation.lengths]
+    readings = [
+        r.variance * sum(math.exp(spread.log_weight) * spread.scale**2 for spread in r.spreads)
+        for r in observation.readings
+    ]
+    return lengths + readings
+
+
+def _widened(measured: Direction, scale: float) -> Direction:
+    return measured if scale == 1.0 else replace(measured, cov=scale**2 * measured.cov)
 
 
 def _alternatives(
     parts: list[_Part],
     keeps: list[NDArray[np.int64]],
-    readings: tuple[ClockReading, ...],
     log_outlier: float,
     dimension: int,
 ) -> Factor:
@@ -108,7 +169,7 @@ def _alternatives(
     outlier = np.full(total, ALL_OUTLIER, np.int8)
     begin = 0
     for part, keep in zip(parts, keeps, strict=True):
-        taken = readings if part.kind == ALL_GOOD else ()
+        taken = part.readings
         out = slice(begin, begin + len(keep))
         to_information(
             keep,

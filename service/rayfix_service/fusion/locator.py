@@ -7,6 +7,7 @@ from rayfix_service.fusion.beam import multiply
 from rayfix_service.fusion.factors import ALL_GOOD, ALL_OUTLIER, Factor, make_factor
 from rayfix_service.fusion.modes import cut_to_free_space, find_modes, unit_points
 from rayfix_service.fusion.observations import Observation, SortedReport, sort_report
+from rayfix_service.fusion.prior import Prior, even_prior, height_prior
 from rayfix_service.fusion.report import Angle, Candidate, Fix, Outcome, Range, Report, Status
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.table import Table
@@ -29,7 +30,7 @@ class Locator:
     def __init__(self, table: Table, settings: FusionSettings | None = None) -> None:
         self.table = table
         self.settings = settings or FusionSettings()
-        self._log_volume = float(np.log(max(table.scene.free_space.volume, 1.0)))
+        self._even_prior = even_prior(table.scene.free_space)
         self._points = unit_points()
 
     def locate(self, report: Report) -> Fix:
@@ -38,18 +39,19 @@ class Locator:
         Raises
         ------
         ReportError
-            When a station is not in the table.
+            When the report cannot be used; its ``path`` names the field.
         """
         sorted_report = sort_report(report, self.table.site)
+        prior = self._prior(report)
         unused = dict(sorted_report.unused)
-        observations, factors = self._factors(sorted_report, unused)
+        observations, factors = self._factors(sorted_report, prior, unused)
         if not factors:
             return self._fix(report, "insufficient", (), {}, unused, 0.0)
         hypotheses = multiply(
             factors,
             num_clocks=sorted_report.num_clocks,
             max_path_length=self.table.site.max_path_length,
-            log_volume=self._log_volume,
+            prior=prior,
             width=self.settings.beam_width,
         )
         if not len(hypotheses):
@@ -81,7 +83,12 @@ class Locator:
             angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=0.02, zenith_stdev=0.02)
             self.locate(Report(measurements=(angle, Range(station_id=station.id, path_length=5.0, stdev=0.5))))
 
-    def _factors(self, sorted_report: SortedReport, unused: dict[int, str]) -> tuple[list[Observation], list[Factor]]:
+    def _prior(self, report: Report) -> Prior:
+        return self._even_prior if report.height is None else height_prior(report.height, self.table.scene.free_space)
+
+    def _factors(
+        self, sorted_report: SortedReport, prior: Prior, unused: dict[int, str]
+    ) -> tuple[list[Observation], list[Factor]]:
         """Factors of the observations that can contribute; why others cannot goes to ``unused``."""
         observations, factors = [], []
         for observation in sorted_report.observations:
@@ -90,7 +97,7 @@ class Locator:
                 self.table.parts[observation.station_id],
                 num_clocks=sorted_report.num_clocks,
                 max_path_length=self.table.site.max_path_length,
-                log_volume=self._log_volume,
+                prior=prior,
                 settings=self.settings,
             )
             if factor is not None:
@@ -156,7 +163,7 @@ def _outlier_probabilities(
     for n, observation in enumerate(observations):
         if observation.angle_index is not None:
             bad[observation.angle_index] = outlier[:, n] == ALL_OUTLIER
-        for index in (*observation.timing_indices, *observation.reference_of):
+        for index in (*observation.timing_indices, *observation.differences):
             # A time difference is as bad as the worse of its two times.
             bad[index] = bad.get(index, False) | (outlier[:, n] != ALL_GOOD)
     return {index: min(1.0, lost + float(weight[mask].sum())) for index, mask in bad.items()}

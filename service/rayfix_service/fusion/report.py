@@ -15,6 +15,41 @@ Frame = Literal["scene", "lcs", "north"]
 Status = Literal["ok", "ambiguous", "inconsistent", "insufficient"]
 
 
+@dataclass(frozen=True, kw_only=True, order=True)
+class ErrorModel:
+    """How the error of a measurement is spread: a Gaussian, or two of them about one middle (contaminated Gaussian).
+
+    Attributes
+    ----------
+    tail_share : float
+        Probability that the error is of the wider one, from 0 to below 1.
+    tail_scale : float
+        Standard deviation of the wider one, in standard deviations of the measurement; at least 1.
+
+    Notes
+    -----
+    J. W. Tukey, "A survey of sampling from contaminated distributions", 1960. A measurement that has nothing to do with
+    the position at all is another matter: see ``FusionSettings.outlier_probability``.
+    """
+
+    tail_share: float = 0.0
+    tail_scale: float = 1.0
+
+
+GAUSSIAN = ErrorModel()
+
+HEAVY_TAILED = ErrorModel(tail_share=0.1, tail_scale=3.0)
+"""One error in ten has three times the standard deviation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Height:
+    """What is known beforehand of the UE's height: a Gaussian on z in the scene frame, m."""
+
+    z: float
+    stdev: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Angle:
     """An angle of arrival (AoA) at one station.
@@ -28,8 +63,11 @@ class Angle:
         measures the azimuth only.
     azimuth_stdev, zenith_stdev : float
         Standard deviations of these two angles, rad (None as for the angle itself).
+    correlation : float
+        Of the two errors, between -1 and 1.
     frame : {"scene", "lcs", "north"}
         Frame in which the angles are given.
+    error_model : ErrorModel
     """
 
     station_id: str
@@ -37,7 +75,9 @@ class Angle:
     azimuth_stdev: float
     zenith: float | None = None
     zenith_stdev: float | None = None
+    correlation: float = 0.0
     frame: Frame = "scene"
+    error_model: ErrorModel = GAUSSIAN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +87,24 @@ class Range:
     station_id: str
     path_length: float
     stdev: float
+    error_model: ErrorModel = GAUSSIAN
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogRange:
+    """A path length whose relative error is Gaussian, as one from a signal strength is.
+
+    Attributes
+    ----------
+    path_length : float, m
+        Exponential of the measured logarithm; the median of what is measured of a path of this length. Positive.
+    log_stdev : float
+        Standard deviation of the natural logarithm.
+    """
+
+    station_id: str
+    path_length: float
+    log_stdev: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +114,7 @@ class TimeOfArrival:
     station_id: str
     path_length: float
     stdev: float
+    error_model: ErrorModel = GAUSSIAN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,16 +125,18 @@ class TimeDifference:
     reference_station_id: str
     length_difference: float
     stdev: float
+    error_model: ErrorModel = GAUSSIAN
 
 
-Measurement = Angle | Range | TimeOfArrival | TimeDifference
+Measurement = Angle | Range | LogRange | TimeOfArrival | TimeDifference
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """The measurements of one transmission."""
+    """The measurements of one transmission, and what is known of the UE's height besides."""
 
     measurements: tuple[Measurement, ...]
+    height: Height | None = None
     target_id: str | None = None
     timestamp: str | None = None
 

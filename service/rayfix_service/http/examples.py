@@ -76,6 +76,40 @@ REPORT_EXAMPLES: dict[str, dict[str, Any]] = {
             ],
         },
     },
+    "bluetooth": {
+        "summary": "A tag at a known height: rough angles with outliers, a round trip, a signal strength",
+        "value": {
+            "target_id": "tag-61cf",
+            "height": {"z_m": 1.5, "stdev_m": 0.2},
+            "measurements": [
+                {
+                    **_aoa("bs1", 33.0, 98.0),
+                    "azimuth_stdev_deg": 5.0,
+                    "zenith_stdev_deg": 5.0,
+                    "correlation": 0.2,
+                    "error_model": "heavy_tailed",
+                },
+                {
+                    "type": "pt",
+                    "station_id": "bs2",
+                    "round_trip_ns": 300027.0,
+                    "reply_ns": 300000.0,
+                    "stdev_ns": 3.4,
+                    "error_model": "heavy_tailed",
+                    "tail_share": 0.2,
+                    "tail_scale": 4.0,
+                },
+                {
+                    "type": "rssi",
+                    "station_id": "bs3",
+                    "rssi_dbm": -65.0,
+                    "power_at_1m_dbm": -42.0,
+                    "path_loss_exponent": 2.0,
+                    "shadowing_stdev_db": 4.0,
+                },
+            ],
+        },
+    },
 }
 """Bodies of ``POST /v1/positions``."""
 

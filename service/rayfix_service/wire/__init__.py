@@ -7,11 +7,10 @@ Inside, everything is SI and radians. This package is the only place where the o
 from rayfix_service.wire.documents import (
     MAX_MEASUREMENTS,
     MAX_REPORTS,
-    METRES_PER_NANOSECOND,
     BatchDocument,
     ReportDocument,
-    WireModel,
 )
+from rayfix_service.wire.fields import METRES_PER_NANOSECOND, WireModel
 from rayfix_service.wire.problems import (
     FieldProblem,
     InvalidReportError,

@@ -16,7 +16,9 @@ from typing import get_args
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from rayfix_service.wire.documents import MEASUREMENT_DOCUMENTS, MISFIT, ReportDocument, WireModel
+from rayfix_service.wire.documents import HeightDocument, ReportDocument
+from rayfix_service.wire.fields import MISFIT, WireModel
+from rayfix_service.wire.measurements import MEASUREMENT_DOCUMENTS
 from rayfix_tables.errors import ReportError
 
 _MAX_PROBLEMS = 50  # a megabyte of unknown keys must not become megabytes of complaints
@@ -114,6 +116,8 @@ def _problem(error: ErrorDetails) -> FieldProblem:
     if len(path) > 2 and path[0] == "measurements":
         # pydantic puts the tag of the union into the path; the document has no such step.
         model, path = MEASUREMENT_DOCUMENTS[str(path[2])], (*path[:2], *path[3:])
+    elif len(path) > 1 and path[0] == "height":
+        model = HeightDocument
     if kind == MISFIT:
         path = path if context["field"] is None else (*path, context["field"])
         text = context["text"]
@@ -128,7 +132,7 @@ def _problem(error: ErrorDetails) -> FieldProblem:
         text = f"{found}; give one of {', '.join(MEASUREMENT_DOCUMENTS)}"
     elif not path:
         text = f'is {shown(value)}; give a JSON object, e.g. {{"measurements": [...]}}'
-    elif len(path) == 2:
+    elif len(path) == 2 and path[0] == "measurements":
         text = f'is {shown(value)}; give a JSON object, e.g. {{"type": "aoa", "station_id": "bs1", ...}}'
     else:
         found = "is missing" if kind == "missing" else f"is {shown(value)}"

@@ -54,6 +54,7 @@ def parse_report(document: Mapping[str, Any] | bytes) -> Report:
         raise InvalidReportError(problems_of_validation(error)) from None
     return Report(
         measurements=tuple(m.measurement() for m in model.measurements),
+        height=None if model.height is None else model.height.height(),
         target_id=model.target_id,
         timestamp=model.timestamp,
     )

@@ -17,6 +17,7 @@ from rayfix_service.fusion import beam
 from rayfix_service.fusion.factors import make_factor
 from rayfix_service.fusion.lookup import NO_DIRECTION, Direction
 from rayfix_service.fusion.observations import sort_report
+from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.report import Angle, Measurement, Range, Report, TimeDifference
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.angles import angles_of
@@ -55,7 +56,7 @@ def range_to(table: Table, name: str, stdev: float) -> Range:
 def closed_form(table: Table, *measurements: Measurement) -> tuple[Array, Array]:
     """Mean and covariance of rayfix's posterior before the cut to the free space."""
     sorted_report = sort_report(Report(measurements=measurements), table.site)
-    limits = {"max_path_length": table.site.max_path_length, "log_volume": float(np.log(60.0))}
+    limits = {"max_path_length": table.site.max_path_length, "prior": Prior(log_volume=float(np.log(60.0)))}
     factors = []
     for observation in sorted_report.observations:
         part = table.parts[observation.station_id]

@@ -1,0 +1,87 @@
+"""Angles as measured, turned into directions of the scene."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.lookup import Direction
+from rayfix_service.fusion.report import Angle
+from rayfix_tables.angles import angles_of, direction, local_to_scene
+from rayfix_tables.site import NO_BIAS, Station
+
+
+def without_bias(angle: Angle, station: Station) -> Angle:
+    """Take the station's bias off an angle, and add its uncertainty.
+
+    The bias is that of the angles as the station reports them, in whatever frame it does.
+    """
+    bias = station.bias
+    if bias == NO_BIAS:
+        return angle
+    azimuth, zenith, zenith_stdev = angle.azimuth - bias.azimuth, angle.zenith, angle.zenith_stdev
+    azimuth_stdev = float(np.hypot(angle.azimuth_stdev, bias.angle_stdev))
+    correlation = angle.correlation
+    if zenith is not None and zenith_stdev is not None:
+        zenith -= bias.zenith
+        widened = float(np.hypot(zenith_stdev, bias.angle_stdev))
+        correlation *= angle.azimuth_stdev * zenith_stdev / (azimuth_stdev * widened)
+        zenith_stdev = widened
+        if not 0.0 <= zenith <= np.pi:
+            # Beyond a pole lies the other side.
+            zenith = float(np.arccos(np.cos(zenith)))
+            azimuth, correlation = azimuth + np.pi, -correlation
+    return replace(
+        angle,
+        azimuth=azimuth,
+        azimuth_stdev=azimuth_stdev,
+        zenith=zenith,
+        zenith_stdev=zenith_stdev,
+        correlation=correlation,
+    )
+
+
+def to_scene(angle: Angle, station: Station, north: float) -> Direction:
+    """Turn a measured angle into the scene frame, its covariance included.
+
+    Parameters
+    ----------
+    north : float, rad
+        Azimuth of geographic north in the scene frame; in the frame "north" azimuths count from there.
+    """
+    azimuth_variance = angle.azimuth_stdev**2
+    if angle.zenith is None or angle.zenith_stdev is None:
+        turn = {"scene": 0.0, "north": north, "lcs": station.orientation[0]}[angle.frame]
+        return Direction(azimuth=angle.azimuth + turn, zenith=None, cov=np.diag([azimuth_variance, np.inf]))
+    covariance = angle.correlation * angle.azimuth_stdev * angle.zenith_stdev
+    cov = np.array([[azimuth_variance, covariance], [covariance, angle.zenith_stdev**2]])
+    if angle.frame == "scene":
+        return Direction(azimuth=angle.azimuth, zenith=angle.zenith, cov=cov)
+    if angle.frame == "north":
+        return Direction(azimuth=angle.azimuth + north, zenith=angle.zenith, cov=cov)
+    rotation = local_to_scene(station.orientation)
+    azimuth, zenith = (float(v) for v in angles_of(rotation @ direction(angle.azimuth, angle.zenith)))
+    turned = _basis(azimuth, zenith).T @ rotation @ _basis(angle.azimuth, angle.zenith)
+    local_sine, sine = np.sin(angle.zenith), max(np.sin(zenith), 1e-9)
+    jacobian = np.diag([1.0 / sine, 1.0]) @ turned @ np.diag([local_sine, 1.0])
+    return Direction(azimuth=azimuth, zenith=zenith, cov=jacobian @ cov @ jacobian.T)
+
+
+def in_field_of_view(station: Station, measured: Direction) -> bool:
+    """Whether a direction lies within the station's cone; one without zenith always counts as inside."""
+    if station.field_of_view >= 2.0 * np.pi or measured.azimuth is None or measured.zenith is None:
+        return True
+    axis = local_to_scene(station.orientation)[:, 0]
+    cosine = float(axis @ direction(measured.azimuth, measured.zenith))
+    return bool(np.arccos(np.clip(cosine, -1.0, 1.0)) <= 0.5 * station.field_of_view)
+
+
+def _basis(azimuth: float, zenith: float) -> NDArray[np.float64]:
+    """Give the unit vectors of growing azimuth and zenith, as columns, shape (3, 2)."""
+    return np.array(
+        [
+            [-np.sin(azimuth), np.cos(zenith) * np.cos(azimuth)],
+            [np.cos(azimuth), np.cos(zenith) * np.sin(azimuth)],
+            [0.0, -np.sin(zenith)],
+        ]
+    )
