@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 class RayEngine(Protocol):
     """Finds first hits."""
 
-    def first_hit(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.int32]:
+    def first_hit(self, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.int32]:
         """Triangle that each ray hits first.
 
         Parameters
@@ -35,7 +35,7 @@ class EmbreeEngine:
         self._scene = EmbreeScene()
         self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles, dtype=np.float32))
 
-    def first_hit(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.int32]:
+    def first_hit(self, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.int32]:
         """See :meth:`RayEngine.first_hit`."""
         if not len(origins):
             return np.zeros(0, np.int32)

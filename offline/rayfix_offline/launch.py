@@ -6,45 +6,18 @@ hit comes from one division, however many reflections went before, and nothing a
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.engine import RayEngine
 from rayfix_offline.materials import Reflectivity
 from rayfix_offline.planes import Planes
-from rayfix_tables.angles import direction
-from rayfix_tables.grid import AngularGrid
 
 OFFSET = 1e-5
 """A reflected ray starts this times (1 + largest coordinate) off its mirror, m."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RaySet:
-    """Directions that sample the sphere, one in each cell of a fine grid.
-
-    Attributes
-    ----------
-    azimuth, zenith : ndarray of shape (n_rays,), rad
-    solid_angle : ndarray of shape (n_rays,), sr
-        What each ray stands for.
-    """
-
-    grid: AngularGrid
-    azimuth: NDArray[np.float64]
-    zenith: NDArray[np.float64]
-    solid_angle: NDArray[np.float64]
-
-    @cached_property
-    def directions(self) -> NDArray[np.float64]:
-        """Unit vectors, shape (n_rays, 3)."""
-        return direction(self.azimuth, self.zenith)
-
-    def __len__(self) -> int:
-        """Return the number of rays."""
-        return len(self.azimuth)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,51 +68,6 @@ class Segments:
     lost_ray_share: float
 
 
-def sample_rays(spacing: float, rng: np.random.Generator) -> RaySet:
-    """Draw one direction in each cell of a grid whose cells are about ``spacing`` [rad] wide."""
-    grid = AngularGrid.from_spacing(spacing)
-    ring = np.repeat(np.arange(grid.num_rings), grid.ring_cells)
-    step = np.arange(grid.num_cells) - grid.ring_offsets[ring]
-    azimuth = -np.pi + (step + rng.random(grid.num_cells)) * 2.0 * np.pi / grid.ring_cells[ring]
-    # Uniform in the cosine within the ring, so that each ray stands for the same solid angle as its cell.
-    high, low = np.cos(ring * np.pi / grid.num_rings), np.cos((ring + 1) * np.pi / grid.num_rings)
-    zenith = np.arccos(high + (low - high) * rng.random(grid.num_cells))
-    return RaySet(grid=grid, azimuth=azimuth, zenith=zenith, solid_angle=grid.solid_angles[ring])
-
-
-def thin(rays: RaySet, spacing: float) -> tuple[RaySet, NDArray[np.int64]]:
-    """Choose one ray in each cell of a coarser grid.
-
-    Parameters
-    ----------
-    spacing : float, rad
-        At least twice that of ``rays``.
-
-    Returns
-    -------
-    rays : RaySet
-    index : ndarray of int64
-        Places of the chosen rays in the finer set.
-    """
-    grid = AngularGrid.from_spacing(spacing)
-    if rays.grid.num_rings < 2 * grid.num_rings - 1:
-        raise ValueError(f"rays {spacing} rad apart cannot be chosen from a set that is hardly finer")
-    cell = grid.nearest(rays.azimuth, rays.zenith)
-    # The rays are stratified already; the middle one of a cell is as good a draw as any.
-    order = np.argsort(cell, kind="stable")
-    count = np.bincount(cell, minlength=grid.num_cells)
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    index = order[np.minimum(first + count // 2, len(order) - 1)]
-    # At twice the spacing a few cells hold no whole finer cell, and may be empty: the ray at their centre is as near.
-    empty = np.flatnonzero(count == 0)
-    index[empty] = rays.grid.nearest(grid.centres[empty, 0], grid.centres[empty, 1])
-    ring = np.repeat(np.arange(grid.num_rings), grid.ring_cells)
-    chosen = RaySet(
-        grid=grid, azimuth=rays.azimuth[index], zenith=rays.zenith[index], solid_angle=grid.solid_angles[ring]
-    )
-    return chosen, index
-
-
 def launch(
     station: NDArray[np.float64],
     directions: NDArray[np.float64],
@@ -171,76 +99,245 @@ def launch(
     start = np.zeros(sequence.shape)
     end = np.zeros(sequence.shape)
     log_gain = np.zeros(sequence.shape)
-    images, mirrors = [station[None, :]], [np.eye(3)[None]]
-    parents, sequence_planes, depths = [np.array([-1])], [np.array([-1])], [np.array([0])]
-    num_sequences = 1
+    sequence[:, 0] = 0
+    direct = np.array([-1], np.int32)
+    generations = [_Generation(parents=direct, planes=direct, images=station[None, :], mirrors=np.eye(3)[None])]
 
     rays = np.arange(num_rays)
-    current = np.zeros(num_rays, np.int64)
-    length = np.zeros(num_rays)
-    reflected = np.zeros(num_rays)
-    image = np.broadcast_to(station, (num_rays, 3))
-    heading = directions
-    origin = image
+    origins = np.broadcast_to(station.astype(np.float32), (num_rays, 3)).copy()
+    headings = directions.astype(np.float32)
+    first = 0
     lost = 0
     for depth in range(max_reflections + 1):
-        faces = engine.first_hit(origin, heading)
-        plane = np.where(faces >= 0, planes.face_planes[faces], -1)
-        normal = planes.normals[plane]
-        approach = np.einsum("ij,ij->i", normal, heading)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            reach = (planes.offsets[plane] - np.einsum("ij,ij->i", normal, image)) / approach
-        # A hit behind the ray's start is float32 noise at an edge: such a ray has slipped through and is lost.
-        hit = (plane >= 0) & np.isfinite(reach) & (reach > length)
-        stop = np.where(hit, reach, _exit_length(image, heading, bounds))
-        stop = np.clip(stop, length, max_path_length)
-        sequence[rays, depth] = current
-        start[rays, depth] = length
-        end[rays, depth] = stop
-        log_gain[rays, depth] = reflected
-        lost += int(np.count_nonzero(~hit))
+        count = len(rays)
+        faces = engine.first_hit(origins, headings)
+        children = _Generation.of_at_most(count if depth < max_reflections else 0)
+        cosines = np.empty(count)
+        num_on, num_children, num_lost = _reflect(
+            depth,
+            faces,
+            rays,
+            directions,
+            planes.face_planes,
+            planes.normals,
+            planes.offsets,
+            bounds,
+            offset,
+            max_path_length,
+            first,
+            generations[-1].images,
+            generations[-1].mirrors,
+            children.parents,
+            children.planes,
+            children.images,
+            children.mirrors,
+            np.full(1 << (2 * max(1, len(children.parents))).bit_length(), -1, np.int32),
+            sequence,
+            start,
+            end,
+            cosines,
+            origins,
+            headings,
+        )
+        lost += num_lost
         if depth == max_reflections:
             break
-        on = np.flatnonzero(hit & (reach < max_path_length))
-        rays, plane, normal, approach, length = rays[on], plane[on], normal[on], approach[on], reach[on]
-        reflected = reflected[on] + reflectivity.log_gain(faces[on], np.abs(approach))
-        keys, inverse = np.unique(current[on] * len(planes) + plane, return_inverse=True)
-        parent, mirror_plane = keys // len(planes), keys % len(planes)
-        all_images, all_mirrors = np.concatenate(images), np.concatenate(mirrors)
-        n = planes.normals[mirror_plane]
-        reflection = np.eye(3) - 2.0 * n[:, :, None] * n[:, None, :]
-        height = np.einsum("ij,ij->i", n, all_images[parent]) - planes.offsets[mirror_plane]
-        images.append(all_images[parent] - 2.0 * height[:, None] * n)
-        mirrors.append(reflection @ all_mirrors[parent])
-        parents.append(parent)
-        sequence_planes.append(mirror_plane)
-        depths.append(np.full(len(keys), depth + 1))
-        current = num_sequences + inverse
-        num_sequences += len(keys)
-        image = images[-1][inverse]
-        heading = np.einsum("ijk,ik->ij", mirrors[-1][inverse], directions[rays])
-        # The side the ray came from: against its old heading.
-        origin = image + length[:, None] * heading - np.sign(approach)[:, None] * normal * offset
+        first += len(generations[-1].parents)
+        generations.append(children.shortened(num_children))
+        rays, origins, headings = rays[:num_on], origins[:num_on], headings[:num_on]
+        loss = reflectivity.log_gain(faces[:num_on], cosines[:num_on])
+        log_gain[rays, depth + 1] = log_gain[rays, depth] + loss
     return Segments(
         sequence=sequence,
         start=start,
         end=end,
         log_gain=log_gain,
         sequences=Sequences(
-            images=np.concatenate(images),
-            mirrors=np.concatenate(mirrors),
-            parents=np.concatenate(parents).astype(np.int32),
-            planes=np.concatenate(sequence_planes).astype(np.int32),
-            num_reflections=np.concatenate(depths).astype(np.int8),
+            images=np.concatenate([g.images for g in generations]),
+            mirrors=np.concatenate([g.mirrors for g in generations]),
+            parents=np.concatenate([g.parents for g in generations]),
+            planes=np.concatenate([g.planes for g in generations]),
+            num_reflections=np.repeat(np.arange(len(generations)), [len(g.parents) for g in generations]).astype(
+                np.int8
+            ),
         ),
         lost_ray_share=lost / max(1, num_rays),
     )
 
 
-def _exit_length(
-    image: NDArray[np.float64], heading: NDArray[np.float64], bounds: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Length at which rays leave the scene's bounding box, shape (n_rays,), m."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reach = (np.where(heading > 0, bounds[1], bounds[0]) - image) / heading
-    return np.asarray(np.where(np.isfinite(reach), reach, np.inf).min(axis=1, initial=np.inf))
+@dataclass(frozen=True, kw_only=True)
+class _Generation:
+    """Sequences of one number of reflections; fields as in :class:`Sequences`."""
+
+    parents: NDArray[np.int32]
+    planes: NDArray[np.int32]
+    images: NDArray[np.float64]
+    mirrors: NDArray[np.float64]
+
+    @classmethod
+    def of_at_most(cls, count: int) -> "_Generation":
+        """Make room; what is never written takes no memory."""
+        return cls(
+            parents=np.empty(count, np.int32),
+            planes=np.empty(count, np.int32),
+            images=np.empty((count, 3)),
+            mirrors=np.empty((count, 3, 3)),
+        )
+
+    def shortened(self, count: int) -> "_Generation":
+        """Copy the first sequences."""
+        return _Generation(
+            parents=self.parents[:count].copy(),
+            planes=self.planes[:count].copy(),
+            images=self.images[:count].copy(),
+            mirrors=self.mirrors[:count].copy(),
+        )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _reflect(
+    depth: Any,
+    faces: Any,
+    rays: Any,
+    directions: Any,
+    face_planes: Any,
+    normals: Any,
+    offsets: Any,
+    bounds: Any,
+    offset: Any,
+    max_path_length: Any,
+    first: Any,
+    images: Any,
+    mirrors: Any,
+    child_parents: Any,
+    child_planes: Any,
+    child_images: Any,
+    child_mirrors: Any,
+    table: Any,
+    sequence: Any,
+    start: Any,
+    end: Any,
+    cosines: Any,
+    origins: Any,
+    headings: Any,
+) -> Any:
+    """End the rays' pieces of one depth at what they hit, and mirror them there.
+
+    The rays that go on are moved to the front of ``faces``, ``rays``, ``cosines``, ``origins`` and ``headings``.
+
+    Parameters
+    ----------
+    faces : ndarray of int32, shape (n,)
+        What each ray hits, -1 for nothing.
+    rays : ndarray of int64, shape (n,)
+        Rows of ``directions``, ``sequence``, ``start`` and ``end``.
+    first : int
+        Number of the first sequence in ``images`` and ``mirrors``; their children follow on these.
+    child_parents, child_planes, child_images, child_mirrors : ndarray
+        Room for the children; none when there are no more reflections.
+    table : ndarray of int32, all -1
+        Room for a hash table of the children; its length is a power of two, larger than their number.
+
+    Returns
+    -------
+    num_on, num_children, num_lost : int
+        Rays that go on, sequences found, and rays that hit nothing.
+    """
+    num_on, num_children, num_lost = 0, 0, 0
+    next_first = first + len(images)
+    last = len(child_parents) == 0
+    for n in range(len(rays)):
+        ray = rays[n]
+        parent = sequence[ray, depth] - first
+        hx, hy, hz = turned(mirrors, parent, directions, ray)
+        length = start[ray, depth]
+        plane = -1
+        reach = 0.0
+        approach = 0.0
+        if faces[n] >= 0:
+            plane = face_planes[faces[n]]
+            nx, ny, nz = normals[plane, 0], normals[plane, 1], normals[plane, 2]
+            approach = nx * hx + ny * hy + nz * hz
+            height = offsets[plane] - (nx * images[parent, 0] + ny * images[parent, 1] + nz * images[parent, 2])
+            reach = height / approach
+        # A hit behind the ray's start is float32 noise at an edge: such a ray has slipped through and is lost.
+        hit = plane >= 0 and np.isfinite(reach) and reach > length
+        if not hit:
+            num_lost += 1
+            reach = max(length, _exit_length(images[parent], (hx, hy, hz), bounds))
+        end[ray, depth] = min(reach, max_path_length)
+        if last or not hit or reach >= max_path_length:
+            continue
+        place = _hashed(parent, plane) & (len(table) - 1)
+        child = table[place]
+        while child >= 0 and (child_parents[child] != parent + first or child_planes[child] != plane):
+            place = (place + 1) & (len(table) - 1)
+            child = table[place]
+        if child < 0:
+            child = num_children
+            num_children += 1
+            table[place] = child
+            child_parents[child] = parent + first
+            child_planes[child] = plane
+            _mirror_at(
+                normals[plane],
+                offsets[plane],
+                images[parent],
+                mirrors[parent],
+                child_images[child],
+                child_mirrors[child],
+            )
+        hx, hy, hz = turned(child_mirrors, child, directions, ray)
+        # The side the ray came from: against its old heading.
+        aside = -np.sign(approach) * offset
+        rays[num_on] = ray
+        faces[num_on] = faces[n]
+        cosines[num_on] = abs(approach)
+        sequence[ray, depth + 1] = next_first + child
+        start[ray, depth + 1] = reach
+        origins[num_on, 0] = child_images[child, 0] + reach * hx + aside * nx
+        origins[num_on, 1] = child_images[child, 1] + reach * hy + aside * ny
+        origins[num_on, 2] = child_images[child, 2] + reach * hz + aside * nz
+        headings[num_on, 0], headings[num_on, 1], headings[num_on, 2] = hx, hy, hz
+        num_on += 1
+    return num_on, num_children, num_lost
+
+
+@numba.njit(cache=True, nogil=True)
+def turned(mirrors: Any, sequence: Any, directions: Any, ray: Any) -> Any:
+    """Direction of a ray after the reflections of a sequence."""
+    x, y, z = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+    return (
+        mirrors[sequence, 0, 0] * x + mirrors[sequence, 0, 1] * y + mirrors[sequence, 0, 2] * z,
+        mirrors[sequence, 1, 0] * x + mirrors[sequence, 1, 1] * y + mirrors[sequence, 1, 2] * z,
+        mirrors[sequence, 2, 0] * x + mirrors[sequence, 2, 1] * y + mirrors[sequence, 2, 2] * z,
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _hashed(parent: Any, plane: Any) -> Any:
+    """Spread pairs of numbers over the integers (Fibonacci hashing)."""
+    return np.int64(
+        ((np.uint64(parent) << np.uint64(32)) ^ np.uint64(plane)) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(32)
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _mirror_at(normal: Any, offset: Any, image: Any, mirror: Any, new_image: Any, new_mirror: Any) -> None:
+    """Mirror an image and a mirror matrix at a plane."""
+    height = normal[0] * image[0] + normal[1] * image[1] + normal[2] * image[2] - offset
+    for i in range(3):
+        new_image[i] = image[i] - 2.0 * height * normal[i]
+        for j in range(3):
+            along = normal[0] * mirror[0, j] + normal[1] * mirror[1, j] + normal[2] * mirror[2, j]
+            new_mirror[i, j] = mirror[i, j] - 2.0 * along * normal[i]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _exit_length(image: Any, heading: Any, bounds: Any) -> Any:
+    """Length at which a ray leaves the scene's bounding box, m."""
+    length = np.inf
+    for i in range(3):
+        if heading[i] != 0.0:
+            length = min(length, (bounds[1 if heading[i] > 0.0 else 0, i] - image[i]) / heading[i])
+    return length

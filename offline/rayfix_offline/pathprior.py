@@ -12,15 +12,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import RaySet, Segments
+from rayfix_offline.launch import Segments, turned
+from rayfix_offline.rays import RaySet
+from rayfix_offline.voxelwalk import GAUSS, new_crossings, over_ray_ranges, power, walk
 from rayfix_tables.freespace import FreeSpace
-
-GOLDEN_RATIO = 0.5 * (1.0 + 5.0**0.5)
-"""Rays are sampled at phases that are multiples of this.
-
-Multiples of it spread evenly over the step. At one phase, the steps of neighbouring rays fall into the same voxels and
-miss others alike: 10 % of noise in the map, however many rays there are.
-"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +44,7 @@ def reflection_factors(segments: Segments, exponent: float) -> NDArray[np.float6
 
 
 def fill_path_prior(
-    rays: RaySet, segments: Segments, free_space: FreeSpace, *, exponent: float, refinement: int
+    rays: RaySet, segments: Segments, free_space: FreeSpace, *, exponent: float, refinement: int, jobs: int = 1
 ) -> PathPrior:
     """Fill the voxel map of one station.
 
@@ -59,6 +54,8 @@ def fill_path_prior(
         beta; 0 takes any path for as likely, a large one only the strongest.
     refinement : int
         A voxel of the map is this many voxels of the free space wide.
+    jobs : int
+        Threads; -1 for one per core. The map is the same with any number.
     """
     voxel_size = free_space.voxel_size * refinement
     shape = -(-np.array(free_space.free.shape) // refinement)
@@ -68,32 +65,42 @@ def fill_path_prior(
     blocks = padded.reshape(shape[0], refinement, shape[1], refinement, shape[2], refinement)
     free_share = blocks.mean(axis=(1, 3, 5))
     depths = segments.sequence.shape[1]
-    power = np.zeros(tuple(shape))
-    first_reached = np.full(tuple(shape), depths, np.int8)
-    _fill(
-        segments.sequence,
-        segments.start,
-        segments.end,
-        segments.sequences.images,
-        segments.sequences.mirrors,
-        rays.directions,
-        rays.solid_angle,
-        reflection_factors(segments, exponent),
-        exponent,
-        free_space.origin,
-        voxel_size,
-        power,
-        first_reached,
-    )
+    factors = reflection_factors(segments, exponent)
+
+    def fill(first: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+        total = np.zeros(tuple(shape))
+        first_reached = np.full(total.shape, depths, np.int8)
+        _fill(
+            segments.sequence[first:stop],
+            segments.start[first:stop],
+            segments.end[first:stop],
+            segments.sequences.images,
+            segments.sequences.mirrors,
+            rays.directions[first:stop],
+            rays.solid_angle[first:stop],
+            factors[first:stop],
+            exponent,
+            free_space.origin,
+            voxel_size,
+            total.shape,
+            *new_crossings(total.shape),
+            total.reshape(-1),
+            first_reached.reshape(-1),
+        )
+        return total, first_reached
+
+    filled = over_ray_ranges(fill, len(rays), jobs)
+    gain = sum((total for total, _ in filled[1:]), start=filled[0][0])
+    first_reached = np.min([reached for _, reached in filled], axis=0)
     # A voxel that a solid cuts is lit over its free part only; at least one free-space voxel's worth.
-    total = power / voxel_size**3 / np.maximum(free_share, 1.0 / refinement**3)
+    total = gain / voxel_size**3 / np.maximum(free_share, 1.0 / refinement**3)
     free = free_share > 0.5
     count = max(1, int(np.count_nonzero(free)))
     coverage = tuple(float(np.count_nonzero(free & (first_reached <= k)) / count) for k in range(depths))
     return PathPrior(origin=free_space.origin, voxel_size=voxel_size, total=total, coverage=coverage)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fill(
     sequence: Any,
     start: Any,
@@ -106,33 +113,31 @@ def _fill(
     exponent: Any,
     origin: Any,
     voxel: Any,
-    power: Any,
+    shape: Any,
+    lengths: Any,
+    voxels: Any,
+    total: Any,
     reached: Any,
 ) -> None:
-    nx, ny, nz = power.shape
-    heading = np.empty(3)
+    """Add the integral of solid angle x length^2 x gain^beta to each voxel."""
     for ray in range(sequence.shape[0]):
-        phase = (ray * GOLDEN_RATIO) % 1.0
         for depth in range(sequence.shape[1]):
             seq = sequence[ray, depth]
             if seq < 0:
                 break
-            for i in range(3):
-                heading[i] = (
-                    mirrors[seq, i, 0] * directions[ray, 0]
-                    + mirrors[seq, i, 1] * directions[ray, 1]
-                    + mirrors[seq, i, 2] * directions[ray, 2]
-                )
-            span = end[ray, depth] - start[ray, depth]
-            steps = int(np.ceil(span / (0.5 * voxel)))
-            for step in range(steps):
-                length = start[ray, depth] + (step + phase) * span / steps
-                ix = int(np.floor((images[seq, 0] + length * heading[0] - origin[0]) / voxel))
-                iy = int(np.floor((images[seq, 1] + length * heading[1] - origin[1]) / voxel))
-                iz = int(np.floor((images[seq, 2] + length * heading[2] - origin[2]) / voxel))
-                if 0 <= ix < nx and 0 <= iy < ny and 0 <= iz < nz:
-                    volume = solid_angle[ray] * length * length * span / steps
+            heading = turned(mirrors, seq, directions, ray)
+            scale = solid_angle[ray] * factors[ray, depth]
+            num_parts = walk(
+                images[seq], heading, start[ray, depth], end[ray, depth], origin, voxel, shape, lengths, voxels
+            )
+            for part in range(num_parts):
+                place, begin = voxels[part], lengths[part]
+                size = lengths[part + 1] - begin
+                if place < 0 or size <= 0.0:
+                    continue
+                for share, portion in GAUSS:
+                    length = begin + share * size
                     # Bounded next to the station, where a voxel's mean gain has no limit.
                     reach = max(length, 0.5 * voxel)
-                    power[ix, iy, iz] += volume * factors[ray, depth] * reach ** (-2.0 * exponent)
-                    reached[ix, iy, iz] = min(reached[ix, iy, iz], depth)
+                    total[place] += scale * portion * size * length * length / power(reach * reach, exponent)
+                reached[place] = min(reached[place], depth)

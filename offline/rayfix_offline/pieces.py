@@ -1,8 +1,8 @@
 """Ray pieces: every ray cut into overlapping slices of length, with the weight and moments of each slice.
 
-A slice has the shape of a hat over log(length): it rises from the previous node to its own and falls to the next, so
-that slices add up to one everywhere. Moment-matched Gaussians of hats add up to a nearly flat density along a long
-ray (ripple 8 %), where those of abutting boxes leave deep valleys (39 %).
+The nodes of the slices are lengths in a constant ratio. A slice has the shape of a hat: it rises from the previous
+node to its own and falls to the next, so that slices add up to one everywhere. Moment-matched Gaussians of hats add
+up to a nearly flat density along a long ray (ripple 8 %), where those of abutting boxes leave deep valleys (39 %).
 
 A piece is shared by all cells of all levels whose window the ray lies in.
 """
@@ -14,8 +14,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import RaySet, Segments
+from rayfix_offline.launch import Segments, turned
 from rayfix_offline.pathprior import PathPrior, reflection_factors
+from rayfix_offline.rays import RaySet
+from rayfix_offline.voxelwalk import GAUSS, new_crossings, over_ray_ranges, power, walk
 
 FIRST_NODE = 0.25
 """Length of the first slice node, m; whatever is nearer belongs to it."""
@@ -71,7 +73,7 @@ def cut_pieces(
     exponent: float,
     kind: Literal["power", "uniform", "paper"],
     slice_ratio: float,
-    step: float,
+    jobs: int = 1,
 ) -> Pieces:
     """Cut rays into pieces.
 
@@ -83,10 +85,11 @@ def cut_pieces(
         Weight along a ray: s^2 pi, s^2, or 1.
     slice_ratio : float
         Ratio of a slice's node to the one before.
-    step : float, m
-        Longest step of the integration along a ray.
+    jobs : int
+        Threads; -1 for one per core. The pieces are the same with any number.
     """
-    counts = _count(segments.sequence, segments.start, segments.end, np.log(slice_ratio))
+    nodes = slice_nodes(float(segments.end.max(initial=0.0)), slice_ratio)
+    counts = _count(segments.sequence, segments.start, segments.end, nodes)
     offsets = np.concatenate([[0], np.cumsum(counts)])
     total = int(offsets[-1])
     pieces = Pieces(
@@ -97,59 +100,69 @@ def cut_pieces(
         mean=np.zeros(total),
         variance=np.zeros(total),
     )
-    _cut(
-        segments.sequence,
-        segments.start,
-        segments.end,
-        segments.sequences.images,
-        segments.sequences.mirrors,
-        rays.directions,
-        reflection_factors(segments, exponent),
-        exponent,
-        prior.origin,
-        prior.voxel_size,
-        prior.total,
-        ("power", "uniform", "paper").index(kind),
-        np.log(slice_ratio),
-        step,
-        offsets,
-        pieces.sequence,
-        pieces.slice,
-        pieces.mass,
-        pieces.mean,
-        pieces.variance,
-    )
+    factors = reflection_factors(segments, exponent)
+
+    def cut(first: int, stop: int) -> None:
+        _cut(
+            segments.sequence[first:stop],
+            segments.start[first:stop],
+            segments.end[first:stop],
+            segments.sequences.images,
+            segments.sequences.mirrors,
+            rays.directions[first:stop],
+            factors[first:stop],
+            exponent,
+            kind != "paper",
+            kind == "power",
+            prior.origin,
+            prior.voxel_size,
+            prior.total.shape,
+            prior.total.reshape(-1),
+            *new_crossings(prior.total.shape),
+            nodes,
+            offsets[first:stop],
+            pieces.sequence,
+            pieces.slice,
+            pieces.mass,
+            pieces.mean,
+            pieces.variance,
+        )
+
+    over_ray_ranges(cut, len(rays), jobs)
     return pieces
 
 
-@numba.njit(cache=True, nogil=True)
-def _node(
-    length: Any,
-    log_ratio: Any,
-) -> Any:
-    """Slice coordinate of a length: n at node n, between the nodes linear in the logarithm."""
-    return max(0.0, np.log(max(length, FIRST_NODE) / FIRST_NODE) / log_ratio)
+def slice_nodes(longest: float, slice_ratio: float) -> NDArray[np.float64]:
+    """Lengths at which slices peak, up to the first beyond ``longest``, m."""
+    count = int(np.ceil(np.log(max(longest / FIRST_NODE, 1.0)) / np.log(slice_ratio))) + 2
+    return np.asarray(FIRST_NODE * slice_ratio ** np.arange(count))
 
 
 @numba.njit(cache=True, nogil=True)
-def _count(
-    sequence: Any,
-    start: Any,
-    end: Any,
-    log_ratio: Any,
-) -> Any:
+def _last_slice(length: Any, nodes: Any, at_least: Any) -> Any:
+    """Last slice that a length belongs to: the first one whose node lies beyond it."""
+    n = at_least
+    while nodes[n] < length:
+        n += 1
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def _count(sequence: Any, start: Any, end: Any, nodes: Any) -> Any:
+    """Pieces of each ray: one for each slice that a segment has a part in."""
     counts = np.zeros(sequence.shape[0], np.int64)
     for ray in range(sequence.shape[0]):
+        last = 0
         for depth in range(sequence.shape[1]):
             if sequence[ray, depth] < 0:
                 break
-            first = int(_node(start[ray, depth], log_ratio))
-            last = int(_node(end[ray, depth], log_ratio))
-            counts[ray] += last - first + 2
+            first = max(0, _last_slice(start[ray, depth], nodes, last) - 1)
+            last = _last_slice(end[ray, depth], nodes, first)
+            counts[ray] += last - first + 1
     return counts
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _cut(
     sequence: Any,
     start: Any,
@@ -159,12 +172,15 @@ def _cut(
     directions: Any,
     factors: Any,
     exponent: Any,
+    by_volume: Any,
+    by_gain: Any,
     origin: Any,
     voxel: Any,
+    shape: Any,
     total: Any,
-    kind: Any,
-    log_ratio: Any,
-    step: Any,
+    lengths: Any,
+    voxels: Any,
+    nodes: Any,
     offsets: Any,
     out_sequence: Any,
     out_slice: Any,
@@ -172,58 +188,89 @@ def _cut(
     out_mean: Any,
     out_variance: Any,
 ) -> None:
-    nx, ny, nz = total.shape
-    heading = np.empty(3)
     for ray in range(sequence.shape[0]):
         at = offsets[ray]
+        last = 0
         for depth in range(sequence.shape[1]):
             seq = sequence[ray, depth]
             if seq < 0:
                 break
-            for i in range(3):
-                heading[i] = (
-                    mirrors[seq, i, 0] * directions[ray, 0]
-                    + mirrors[seq, i, 1] * directions[ray, 1]
-                    + mirrors[seq, i, 2] * directions[ray, 2]
-                )
             begin, stop = start[ray, depth], end[ray, depth]
-            first = int(_node(begin, log_ratio))
-            last = int(_node(stop, log_ratio))
-            for n in range(first, last + 2):
+            first = max(0, _last_slice(begin, nodes, last) - 1)
+            last = _last_slice(stop, nodes, first)
+            for n in range(first, last + 1):
                 out_sequence[at + n - first] = seq
                 out_slice[at + n - first] = n
+            heading = turned(mirrors, seq, directions, ray)
+            num_parts = walk(images[seq], heading, begin, stop, origin, voxel, shape, lengths, voxels)
+            peak = _last_slice(begin, nodes, first)  # the slice that rises where the walk is
+            low = nodes[peak - 1] if peak > 0 else 0.0
+            sum0, sum1, sum2, sum3 = 0.0, 0.0, 0.0, 0.0  # moments about the last node, before the hats
+            length = begin
+            for part in range(num_parts):
+                # The path's probability, times length^(2 beta) and before it is capped to 1. A path so weak that its
+                # gain^beta is 0 is never reported, and outside of the map there is no place to be.
+                probability = 0.0
+                if voxels[part] >= 0 and factors[ray, depth] > 0.0:
+                    probability = factors[ray, depth] / total[voxels[part]]  # infinite where the map is 0
+                while length < lengths[part + 1]:
+                    reach = min(lengths[part + 1], nodes[peak])
+                    for share, portion in GAUSS:
+                        middle = length + share * (reach - length)
+                        weight = portion * (reach - length) * (middle * middle if by_volume else 1.0)
+                        if by_gain:
+                            weight *= min(1.0, probability / power(middle * middle, exponent))
+                        above = middle - low
+                        sum0 += weight
+                        sum1 += weight * above
+                        sum2 += weight * above * above
+                        sum3 += weight * above * above * above
+                    length = reach
+                    if length == nodes[peak] or length == stop:
+                        _share_out(
+                            peak, nodes, sum0, sum1, sum2, sum3, at + peak - first, out_mass, out_mean, out_variance
+                        )
+                        sum0, sum1, sum2, sum3 = 0.0, 0.0, 0.0, 0.0
+                        low = nodes[peak]
+                        peak += 1
             for n in range(first, last + 1):
-                a = begin if n == first else FIRST_NODE * np.exp(n * log_ratio)
-                b = stop if n == last else FIRST_NODE * np.exp((n + 1) * log_ratio)
-                if b <= a:
-                    continue
-                steps = int(np.ceil((b - a) / step))
-                size = (b - a) / steps
-                for k in range(steps):
-                    length = a + (k + 0.5) * size
-                    weight = size
-                    if kind != 2:
-                        weight *= length * length
-                    if kind == 0:
-                        ix = int(np.floor((images[seq, 0] + length * heading[0] - origin[0]) / voxel))
-                        iy = int(np.floor((images[seq, 1] + length * heading[1] - origin[1]) / voxel))
-                        iz = int(np.floor((images[seq, 2] + length * heading[2] - origin[2]) / voxel))
-                        ix = min(max(ix, 0), nx - 1)
-                        iy = min(max(iy, 0), ny - 1)
-                        iz = min(max(iz, 0), nz - 1)
-                        own = factors[ray, depth] * length ** (-2.0 * exponent)
-                        # A path so weak that its gain^beta is 0 is never reported.
-                        weight *= min(1.0, own / max(total[ix, iy, iz], own)) if own > 0.0 else 0.0
-                    share = _node(length, log_ratio) - n
-                    for side in range(2):
-                        part = weight * (share if side else 1.0 - share)
-                        i = at + n - first + side
-                        out_mass[i] += part
-                        out_mean[i] += part * length
-                        out_variance[i] += part * length * length
-            for n in range(first, last + 2):
                 i = at + n - first
                 if out_mass[i] > 0.0:
-                    out_mean[i] /= out_mass[i]
-                    out_variance[i] = max(0.0, out_variance[i] / out_mass[i] - out_mean[i] ** 2)
-            at += last - first + 2
+                    off = out_mean[i] / out_mass[i]
+                    out_mean[i] = nodes[n] + off
+                    out_variance[i] = max(0.0, out_variance[i] / out_mass[i] - off * off)
+            at += last - first + 1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _share_out(
+    peak: Any,
+    nodes: Any,
+    sum0: Any,
+    sum1: Any,
+    sum2: Any,
+    sum3: Any,
+    i: Any,
+    out_mass: Any,
+    out_mean: Any,
+    out_variance: Any,
+) -> None:
+    """Share what lies between two nodes between the slice that rises there, piece i, and the one that falls.
+
+    The sums are moments about the lower node; those of each piece are taken about its own node.
+    """
+    if peak == 0:
+        # The first slice takes all before its node.
+        node = nodes[0]
+        out_mass[i] += sum0
+        out_mean[i] += sum1 - node * sum0
+        out_variance[i] += sum2 - 2.0 * node * sum1 + node * node * sum0
+        return
+    width = nodes[peak] - nodes[peak - 1]
+    rising0, rising1, rising2 = sum1 / width, sum2 / width, sum3 / width
+    out_mass[i] += rising0
+    out_mean[i] += rising1 - width * rising0
+    out_variance[i] += rising2 - 2.0 * width * rising1 + width * width * rising0
+    out_mass[i - 1] += sum0 - rising0
+    out_mean[i - 1] += sum1 - rising1
+    out_variance[i - 1] += sum2 - rising2

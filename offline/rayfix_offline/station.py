@@ -96,7 +96,7 @@ def build_station(plan: StationPlan, job: Job, remote: "Cluster | None", report:
         if remote is not None and former is None:
             launch, fitting = remote.launch(plan), remote.fit_blocks(plan, missing)
         else:
-            trace = trace_station(plan.section, job.site, job.twin)
+            trace = trace_station(plan.section, job.site, job.twin, jobs=job.jobs)
             if former is not None:
                 report(f"{plan.station.id}: comparing", done)
                 kept, missing = _split(missing, former.kept_cells(trace, job.tolerance))

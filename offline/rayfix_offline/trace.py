@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import RaySet, Sequences, launch, sample_rays, thin
+from rayfix_offline.launch import Sequences, launch
 from rayfix_offline.materials import Reflectivity, constant_reflectivity, itu_reflectivity
 from rayfix_offline.pathprior import fill_path_prior
 from rayfix_offline.pieces import Pieces, cut_pieces
+from rayfix_offline.rays import RaySet, sample_rays, thin
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.surfaces import surface_sequences
 from rayfix_offline.twin import Twin
@@ -26,9 +27,6 @@ CELLS_PER_WINDOW = 0.8
 
 SLICE_RATIO = 1.2
 """Ratio of a slice's length to the one before."""
-
-INTEGRATION_STEP = 0.1
-"""Longest step of the integration along a ray, m."""
 
 PRIOR_REFINEMENT = 2
 """A voxel of the path prior is this many voxels of the free space wide."""
@@ -95,10 +93,15 @@ def reflectivity_of(site: SiteFile, twin: Twin) -> Reflectivity:
     )
 
 
-def trace_station(station: StationSection, site: SiteFile, twin: Twin) -> StationTrace:
+def trace_station(station: StationSection, site: SiteFile, twin: Twin, *, jobs: int = 1) -> StationTrace:
     """Launch a station's rays and cut them into pieces.
 
     The directions depend on the site's seed and the station's id alone.
+
+    Parameters
+    ----------
+    jobs : int
+        Threads; -1 for one per core. The trace is the same with any number.
     """
     windows = np.deg2rad(site.table.windows_deg)
     spacing = float(windows[0]) / RAYS_PER_WINDOW
@@ -115,7 +118,7 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin) -> Statio
         max_path_length=site.propagation.max_path_length_m,
     )
     exponent = site.propagation.path_prior_exponent
-    prior = fill_path_prior(rays, segments, twin.free_space, exponent=exponent, refinement=PRIOR_REFINEMENT)
+    prior = fill_path_prior(rays, segments, twin.free_space, exponent=exponent, refinement=PRIOR_REFINEMENT, jobs=jobs)
     pieces = cut_pieces(
         rays,
         segments,
@@ -123,7 +126,7 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin) -> Statio
         exponent=exponent,
         kind=site.propagation.path_prior,
         slice_ratio=SLICE_RATIO,
-        step=INTEGRATION_STEP,
+        jobs=jobs,
     )
     over_surfaces = surface_sequences(segments.sequences, twin.planes)
     levels = []

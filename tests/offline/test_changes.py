@@ -8,10 +8,11 @@ import pytest
 from numpy.typing import NDArray
 
 from rayfix_offline.changes import SMALLEST, cell_changes, ray_changes
-from rayfix_offline.launch import RaySet, Segments, sample_rays
+from rayfix_offline.launch import Segments
 from rayfix_offline.moments import CUTOFF
 from rayfix_offline.pathprior import fill_path_prior
 from rayfix_offline.pieces import cut_pieces
+from rayfix_offline.rays import RaySet, sample_rays
 from rayfix_offline.trace import LevelRays
 from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_tables.angles import tangent
@@ -49,7 +50,7 @@ def trace(box: Callable[..., NDArray[np.float64]], launch_in: Launch) -> Callabl
         segments = launch_in(triangles, STATION, rays.directions, max_reflections=2)
         free = FreeSpace(origin=np.zeros(3), voxel_size=0.1, free=np.ones((40, 50, 30), bool))
         prior = fill_path_prior(rays, segments, free, exponent=2.0, refinement=2)
-        pieces = cut_pieces(rays, segments, prior, exponent=2.0, kind=kind, slice_ratio=1.2, step=0.1)
+        pieces = cut_pieces(rays, segments, prior, exponent=2.0, kind=kind, slice_ratio=1.2)
         level = LevelRays(
             window=WINDOW,
             grid=AngularGrid.from_spacing(WINDOW / 0.8),

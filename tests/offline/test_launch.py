@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 
-from rayfix_offline.launch import Segments, launch, sample_rays
+from rayfix_offline.launch import Segments, launch
 from rayfix_offline.materials import constant_reflectivity
 from rayfix_offline.planes import merge_coplanar
+from rayfix_offline.rays import sample_rays
 
 Launch = Callable[..., Segments]
 Vectors = Callable[[int, int], NDArray[np.float64]]

@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import RaySet, Segments, Sequences, sample_rays
+from rayfix_offline.launch import Segments, Sequences
 from rayfix_offline.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR, blur, gather_groups, new_rows
 from rayfix_offline.pathprior import PathPrior
 from rayfix_offline.pieces import Pieces, cut_pieces
+from rayfix_offline.rays import RaySet, sample_rays
 from rayfix_tables.angles import direction, tangent
 
 Launch = Callable[..., Segments]
@@ -34,7 +35,7 @@ def traced(clutter: NDArray[np.float64], launch_in: Launch) -> Traced:
     rays = sample_rays(0.065, np.random.default_rng(0))
     segments = launch_in(clutter, (3.6, 0.4, 2.6), rays.directions, max_reflections=2)
     prior = PathPrior(origin=np.zeros(3), voxel_size=1.0, total=np.ones((4, 5, 3)), coverage=(1.0,))
-    pieces = cut_pieces(rays, segments, prior, exponent=1.0, kind="uniform", slice_ratio=1.35, step=0.1)
+    pieces = cut_pieces(rays, segments, prior, exponent=1.0, kind="uniform", slice_ratio=1.35)
     return Traced(rays, pieces, segments.sequences)
 
 

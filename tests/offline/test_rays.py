@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import RaySet, sample_rays, thin
+from rayfix_offline.rays import RaySet, sample_rays, thin
 
 seeds = st.integers(0, 2**32 - 1)
 
