@@ -171,7 +171,8 @@ def merge_runnalls(weight: Any, mean: Any, cov: Any, label: Any, max_components:
         left -= 1
         for k in range(j):
             cost[k, j] = np.inf
-        union_log_dets(i, 0, count, weight, middle, triangle, scratch, row)
+        # A plain 0 would have it compiled once more, for a constant.
+        union_log_dets(i, np.int64(0), count, weight, middle, triangle, scratch, row)
         log_det[i] = row[i]
         for k in range(count):
             if alive[k] and k != i:

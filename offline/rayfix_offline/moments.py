@@ -72,7 +72,7 @@ def gather_groups(
     """
     keys = np.empty((64, 2), np.int64)
     sums = np.zeros((64, NUM_SUMS))
-    count = 0
+    count = np.int64(0)  # a plain 0 would have _add_ray compiled once more, for a constant
     # Groups by slice, for the sequences that the cell has: all of a station's would be too many to keep a place for.
     slots = np.full((16, num_slices), -1, np.int32)
     num_rows = 0
@@ -102,13 +102,13 @@ def gather_groups(
             first, last = piece_offsets[ray], piece_offsets[ray + 1]
             if count + last - first > len(sums):
                 capacity = 2 * (count + last - first)
-                keys, sums = _grown(keys, capacity), _grown(sums, capacity)
+                keys, sums = _grown(keys, capacity, 0), _grown(sums, capacity, 0)
             for piece in range(first, last):
                 if rows[piece_sequence[piece]] < 0 and density * piece_mass[piece] > 0.0:
                     rows[piece_sequence[piece]] = num_rows
                     num_rows += 1
-            while num_rows > len(slots):
-                slots = np.concatenate((slots, np.full_like(slots, -1)))
+            if num_rows > len(slots):
+                slots = _grown(slots, 2 * num_rows, -1)
             count = _add_ray(
                 density,
                 horizontal,
@@ -307,12 +307,12 @@ def blur(
 
 
 @numba.njit(cache=True, nogil=True)
-def _grown(
-    array: Any,
-    capacity: Any,
-) -> Any:
-    larger = np.zeros((capacity, *array.shape[1:]), array.dtype)
-    larger[: len(array)] = array
+def _grown(array: Any, capacity: Any, filling: Any) -> Any:
+    """Copy rows into a larger array, in loops: an assignment of slices takes seconds to compile."""
+    larger = np.full((capacity, array.shape[1]), filling, array.dtype)
+    for i in range(len(array)):
+        for j in range(array.shape[1]):
+            larger[i, j] = array[i, j]
     return larger
 
 
