@@ -1,11 +1,12 @@
 """The builder's speed, as ratios: the ray stage against bare Embree, the fit by tubes against the fit by em.
 
-Everything runs on one thread and is given as the median of five runs of processor time; ``--build`` builds the whole
-hall as well, with all cores.
+What is compared runs on one thread and is given as the median of five runs of processor time. ``--build`` builds the
+whole hall as well, on all cores: once with nothing compiled yet, and once more.
 """
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -13,17 +14,23 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from rayfix.example.files import write_example
 from rayfix_offline import trace
 from rayfix_offline.em import ExpectationMaximisation, fit_em
 from rayfix_offline.engine import RayEngine
+from rayfix_offline.launch import Segments, launch
+from rayfix_offline.moments import gather_groups, new_rows
+from rayfix_offline.pathprior import fill_path_prior
+from rayfix_offline.pieces import cut_pieces
+from rayfix_offline.rays import RaySet, sample_rays
 from rayfix_offline.site import SiteFile, read_site
-from rayfix_offline.trace import StationTrace, trace_station
+from rayfix_offline.trace import LevelRays, StationTrace, reflectivity_of, trace_station
 from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_offline.twin import Twin, prepare_twin
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
@@ -43,11 +50,10 @@ def main() -> None:
         site = read_site(site_path)
         twin = prepare_twin(site, site_path.parent)
         print(f"the bundled hall, {len(twin.scene.faces)} triangles; medians of {RUNS} runs on one thread")
-        measure_rays(site, twin)
+        seconds = measure_rays(site, twin)
         traced = trace_station(site.stations[0], site, twin)
-        measure_fits(traced, options.cells, options.em_cells, np.random.default_rng(options.seed))
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        print(f"peak memory so far: {peak / 1024:.0f} MiB")
+        seconds |= measure_fits(traced, options.cells, options.em_cells, np.random.default_rng(options.seed))
+        print_stages(seconds)
         if options.build:
             measure_build(site_path)
 
@@ -57,73 +63,165 @@ class RecordingEngine:
 
     def __init__(self, engine: RayEngine) -> None:
         self.engine = engine
-        self.queries: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+        self.queries: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
 
-    def first_hit(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.int32]:
+    def first_hit(self, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.int32]:
         """See :meth:`RayEngine.first_hit`."""
-        self.queries.append((np.array(origins), np.array(directions)))
+        self.queries.append((np.array(origins, np.float32), np.array(directions, np.float32)))
         return self.engine.first_hit(origins, directions)
 
 
-def measure_rays(site: SiteFile, twin: Twin) -> None:
-    """Time the launch of one station as a build does it, and Embree alone on the very rays of that launch."""
-    with mock.patch.object(trace, "launch", wraps=trace.launch) as called:
-        trace_station(site.stations[0], site, twin)
-    positional, named = called.call_args
+def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
+    """Time the ray stage of one station, and Embree alone on the very rays of that launch.
+
+    The stage is all between the station's position and its segments: directions are drawn, rays intersected, hits
+    refined, mirrored and booked by sequence and gain. Embree alone gets the same rays in arrays of its own precision,
+    one batch for each number of reflections, and looks for the triangle that each hits first. Every segment, the
+    reflected ones too, counts as a ray.
+    """
+    propagation = site.propagation
+    spacing = float(np.deg2rad(site.table.windows_deg[0])) / trace.RAYS_PER_WINDOW
+    exponent = propagation.path_prior_exponent
+
+    def run_stage(engine: RayEngine = twin.engine) -> tuple[RaySet, Segments]:
+        rays = sample_rays(spacing, np.random.default_rng(1))
+        segments = launch(
+            np.array(site.stations[0].position_m),
+            rays.directions,
+            engine=engine,
+            planes=twin.planes,
+            reflectivity=reflectivity_of(site, twin),
+            bounds=twin.scene.bounds,
+            max_reflections=propagation.max_reflections,
+            max_path_length=propagation.max_path_length_m,
+        )
+        return rays, segments
+
     recorder = RecordingEngine(twin.engine)
-    segments = trace.launch(*positional, **{**named, "engine": recorder})
-    num_rays = len(segments.sequence)
-    num_segments = int(np.count_nonzero(segments.sequence >= 0))
-    stage = median_seconds(lambda: trace.launch(*positional, **named))
-    bare = median_seconds(lambda: [twin.engine.first_hit(*query) for query in recorder.queries])
-    direct = median_seconds(lambda: twin.engine.first_hit(*recorder.queries[0]))
-    whole = median_seconds(lambda: trace_station(site.stations[0], site, twin))
+    rays, segments = run_stage(recorder)
+    num_segments = sum(len(origins) for origins, _ in recorder.queries)
+    scene = EmbreeScene()
+    mesh = TriangleMesh(scene, twin.scene.triangles.astype(np.float32))
+    bare = median_seconds(lambda: [scene.run(*query) for query in recorder.queries])
+    del mesh
+    stage = median_seconds(run_stage)
+    prior = fill_path_prior(rays, segments, twin.free_space, exponent=exponent, refinement=trace.PRIOR_REFINEMENT)
     print(
-        f"rays: {num_rays} with up to {site.propagation.max_reflections} reflections, {num_segments} segments\n"
-        f"  ray stage            {num_segments / stage / 1e6:6.2f} million segments/s, "
-        f"{num_rays / stage / 1e6:.2f} million rays/s\n"
-        f"  Embree, same rays    {num_segments / bare / 1e6:6.2f} million first hits/s\n"
-        f"  Embree, direct rays  {num_rays / direct / 1e6:6.2f} million first hits/s\n"
-        f"  ray stage / Embree   {bare / stage:6.2f} of its rate on the same rays, "
-        f"{num_segments / stage * direct / num_rays:.2f} of that on direct rays\n"
-        f"  the launch takes {stage / whole:.0%} of the {whole:.2f} s in which a station is traced and cut into pieces"
+        f"rays: {len(rays)} with up to {propagation.max_reflections} reflections, {num_segments} segments\n"
+        f"  ray stage          {num_segments / stage / 1e6:6.2f} million rays/s\n"
+        f"  Embree alone       {num_segments / bare / 1e6:6.2f} million rays/s\n"
+        f"  stage / Embree     {bare / stage:6.2f}"
     )
+    return {
+        "rays": stage,
+        "path prior": median_seconds(
+            lambda: fill_path_prior(
+                rays, segments, twin.free_space, exponent=exponent, refinement=trace.PRIOR_REFINEMENT
+            )
+        ),
+        "pieces": median_seconds(
+            lambda: cut_pieces(
+                rays,
+                segments,
+                prior,
+                exponent=exponent,
+                kind=propagation.path_prior,
+                slice_ratio=trace.SLICE_RATIO,
+            )
+        ),
+    }
 
 
-def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: np.random.Generator) -> None:
-    """Time both fits on the same kind of cells, window by window."""
+def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: np.random.Generator) -> dict[str, float]:
+    """Time both fits on neighbouring cells, as blocks have them, window by window."""
     component = sum(
         int(np.prod(shape, dtype=int)) * np.dtype(FIELD_DTYPES[name]).itemsize for name, shape in FIELD_SHAPES.items()
     )
     em = ExpectationMaximisation(num_components=(16,))
+    seconds = {}
     print("fits:   window   tubes [cells/s]   em, K = 16 [cells/s]   ratio   components   bytes per cell, tubes")
     for level in traced.levels:
-        numbers = rng.choice(level.grid.num_cells, min(num_cells, level.grid.num_cells), replace=False)
+        name = f"{np.rad2deg(level.window):.2f} deg"
+        count = min(num_cells, level.grid.num_cells)
+        numbers = rng.integers(level.grid.num_cells - count + 1) + np.arange(count)
         centres = level.grid.centres[numbers]
         counts, _, _ = fit_tubes(centres, level, TubeFit())
-        tubes = median_seconds(lambda lv=level, c=centres: fit_tubes(c, lv, TubeFit())) / len(numbers)
+        tubes = median_seconds(lambda lv=level, c=centres: fit_tubes(c, lv, TubeFit())) / count
+        gather = median_seconds(lambda lv=level, c=centres: gather_cells(c, lv)) / count
         some, chosen = centres[:num_em_cells], numbers[:num_em_cells]
         slow = median_seconds(lambda lv=level, c=some, n=chosen: fit_em(c, n, lv, em)) / len(some)
         print(
-            f"  {np.rad2deg(level.window):8.2f} deg {1.0 / tubes:15.0f} {1.0 / slow:22.1f} {slow / tubes:7.0f} "
+            f"  {name:>12} {1.0 / tubes:15.0f} {1.0 / slow:22.1f} {slow / tubes:7.0f} "
             f"{counts.mean():12.1f} {counts.mean() * component:14.0f}"
+        )
+        seconds[f"{name}: gather"] = gather * level.grid.num_cells
+        seconds[f"{name}: merge, the rest"] = (tubes - gather) * level.grid.num_cells
+    return seconds
+
+
+def gather_cells(centres: NDArray[np.float64], level: LevelRays) -> None:
+    """Gather the groups of cells, and no more."""
+    rays, pieces, sequences = level.rays, level.pieces, level.sequences
+    rows = new_rows(len(sequences.images))
+    for centre in centres:
+        gather_groups(
+            centre[0],
+            centre[1],
+            level.window,
+            rays.grid.ring_offsets,
+            rays.grid.ring_cells,
+            rays.azimuth,
+            rays.zenith,
+            rays.solid_angle,
+            rays.directions,
+            pieces.offsets,
+            pieces.sequence,
+            pieces.slice,
+            pieces.mass,
+            pieces.mean,
+            pieces.variance,
+            sequences.images,
+            sequences.mirrors,
+            pieces.num_slices,
+            rows,
         )
 
 
+def print_stages(seconds: dict[str, float]) -> None:
+    """Print what the stages of one station take, the fits of all its cells extrapolated from those measured."""
+    total = sum(seconds.values())
+    print(f"stages of one station, {total:.2f} s of one thread:")
+    for name, value in seconds.items():
+        print(f"  {name:28} {value:6.2f} s {value / total:6.1%}")
+
+
 def measure_build(site_path: Path) -> None:
-    """Build the hall in a process of its own."""
-    table = site_path.with_name("hall.h5")
-    command = [sys.executable, "-m", "rayfix", "build", str(site_path), "-o", str(table), "--no-progress", "--json"]
-    begin = time.perf_counter()
-    summary = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    seconds = time.perf_counter() - begin
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    cells = sum(station["num_cells"] for station in summary["stations"])
-    print(
-        f"build: {seconds:.0f} s for {cells} cells of {len(summary['stations'])} stations on all cores, "
-        f"{cells / seconds:.0f} cells/s; {table.stat().st_size / 1e6:.0f} MB, "
-        f"{table.stat().st_size / cells:.0f} bytes per cell; peak memory {peak / 1024:.0f} MiB"
-    )
+    """Build the hall in processes of their own, the first of which compiles all kernels."""
+    with tempfile.TemporaryDirectory() as cache:
+        for name in ("nothing compiled", "compiled"):
+            table = site_path.with_name("hall.h5")
+            table.unlink(missing_ok=True)
+            command = [sys.executable, "-m", "rayfix", "build", str(site_path), "-o", str(table), "--no-progress"]
+            before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+            done = subprocess.run(
+                [*command, "--json"],
+                check=True,
+                capture_output=True,
+                text=True,
+                env={**os.environ, "NUMBA_CACHE_DIR": cache},
+            )
+            seconds = time.perf_counter() - begin
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            worked = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+            summary = json.loads(done.stdout)
+            cells = sum(station["num_cells"] for station in summary["stations"])
+            size = table.stat().st_size
+            print(
+                f"build, {name}: {seconds:.1f} s on {os.cpu_count()} cores, {worked:.1f} s of processor time; "
+                f"{cells} cells of {len(summary['stations'])} stations, {cells / seconds:.0f} cells/s; "
+                f"{size / 1e6:.0f} MB, {size / cells:.0f} bytes per cell; "
+                f"peak memory {summary['peak_bytes'] / 1e6:.0f} MB"
+            )
 
 
 def median_seconds(run: Callable[[], object]) -> float:
@@ -131,9 +229,9 @@ def median_seconds(run: Callable[[], object]) -> float:
     run()
     times = []
     for _ in range(RUNS):
-        begin = time.process_time()
+        begin = time.thread_time()
         run()
-        times.append(time.process_time() - begin)
+        times.append(time.thread_time() - begin)
     return float(np.median(times))
 
 
