@@ -16,6 +16,7 @@ from rayfix_tables.version import software_version
 if TYPE_CHECKING:
     from rayfix.api import Locator as Locator
     from rayfix.api import build as build
+    from rayfix_service.fusion.posterior import Posterior as Posterior
     from rayfix_service.fusion.report import Fix as Fix
     from rayfix_service.fusion.report import Report as Report
     from rayfix_service.impulse_response import range_from_impulse_response as range_from_impulse_response
@@ -28,6 +29,7 @@ __version__ = software_version()
 __all__ = [
     "Fix",
     "Locator",
+    "Posterior",
     "RayfixError",
     "Report",
     "Table",

@@ -9,6 +9,7 @@ from rayfix_tables.table import Table
 
 with needs_extra("service"):
     from rayfix_service.fusion.locator import Locator as _Locator
+    from rayfix_service.fusion.posterior import Posterior
     from rayfix_service.fusion.report import Fix, Report
     from rayfix_service.impulse_response import range_from_impulse_response
     from rayfix_service.ranging import range_from_round_trip, range_from_rssi, range_from_times
@@ -17,6 +18,7 @@ with needs_extra("service"):
 __all__ = [
     "Fix",
     "Locator",
+    "Posterior",
     "Report",
     "build",
     "range_from_impulse_response",
@@ -67,3 +69,18 @@ class Locator(_Locator):
             When the report cannot be used; its ``path`` names the field.
         """
         return super().locate(report if isinstance(report, Report) else parse_report(report))
+
+    def posterior(self, report: Report | Mapping[str, Any]) -> Posterior:
+        """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.
+
+        Parameters
+        ----------
+        report : Report or mapping
+            A mapping has the form of the JSON that ``POST /v1/positions`` takes.
+
+        Raises
+        ------
+        ReportError
+            When the report cannot be used; its ``path`` names the field.
+        """
+        return super().posterior(report if isinstance(report, Report) else parse_report(report))

@@ -1,12 +1,15 @@
 """The face of the fusion: a table and a report in, a fix out."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.beam import multiply
+from rayfix_service.fusion.beam import Hypotheses, multiply
 from rayfix_service.fusion.factors import ALL_GOOD, ALL_OUTLIER, Factor, make_factor
 from rayfix_service.fusion.modes import cut_to_free_space, find_modes, unit_points
 from rayfix_service.fusion.observations import Observation, SortedReport, sort_report
+from rayfix_service.fusion.posterior import Posterior, make_posterior
 from rayfix_service.fusion.prior import Prior, even_prior, height_prior
 from rayfix_service.fusion.report import Angle, Candidate, Fix, Outcome, Range, Report, Status
 from rayfix_service.fusion.settings import FusionSettings
@@ -41,19 +44,9 @@ class Locator:
         ReportError
             When the report cannot be used; its ``path`` names the field.
         """
-        sorted_report = sort_report(report, self.table.site)
-        prior = self._prior(report)
-        unused = dict(sorted_report.unused)
-        observations, factors = self._factors(sorted_report, prior, unused)
-        if not factors:
+        observations, unused, _, hypotheses = self._product(report)
+        if hypotheses is None:
             return self._fix(report, "insufficient", (), {}, unused, 0.0)
-        hypotheses = multiply(
-            factors,
-            num_clocks=sorted_report.num_clocks,
-            max_path_length=self.table.site.max_path_length,
-            prior=prior,
-            width=self.settings.beam_width,
-        )
         if not len(hypotheses):
             outlier = _outlier_probabilities(observations, hypotheses.outlier, np.empty(0), 1.0)
             return self._fix(report, "inconsistent", (), outlier, unused, hypotheses.log_lost)
@@ -77,14 +70,40 @@ class Locator:
         outlier = _outlier_probabilities(observations, hypotheses.outlier, weight, lost)
         return self._fix(report, status, candidates, outlier, unused, log_evidence)
 
+    def posterior(self, report: Report) -> Posterior:
+        """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.
+
+        Raises
+        ------
+        ReportError
+            When the report cannot be used; its ``path`` names the field.
+        """
+        product = self._product(report)
+        return make_posterior(product.hypotheses, product.prior, self.table.scene.free_space)
+
     def warm_up(self) -> None:
         """Compile the kernels by locating a report of each kind."""
         for station in self.table.site.stations:
             angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=0.02, zenith_stdev=0.02)
             self.locate(Report(measurements=(angle, Range(station_id=station.id, path_length=5.0, stdev=0.5))))
 
-    def _prior(self, report: Report) -> Prior:
-        return self._even_prior if report.height is None else height_prior(report.height, self.table.scene.free_space)
+    def _product(self, report: Report) -> "_Product":
+        """Multiply what the measurements say."""
+        sorted_report = sort_report(report, self.table.site)
+        free_space = self.table.scene.free_space
+        prior = self._even_prior if report.height is None else height_prior(report.height, free_space)
+        unused = dict(sorted_report.unused)
+        observations, factors = self._factors(sorted_report, prior, unused)
+        hypotheses = None
+        if factors:
+            hypotheses = multiply(
+                factors,
+                num_clocks=sorted_report.num_clocks,
+                max_path_length=self.table.site.max_path_length,
+                prior=prior,
+                width=self.settings.beam_width,
+            )
+        return _Product(observations, unused, prior, hypotheses)
 
     def _factors(
         self, sorted_report: SortedReport, prior: Prior, unused: dict[int, str]
@@ -143,6 +162,15 @@ class Locator:
             target_id=report.target_id,
             timestamp=report.timestamp,
         )
+
+
+class _Product(NamedTuple):
+    """Hypotheses of a report, None where nothing could be used, and what they were made of."""
+
+    observations: list[Observation]
+    unused: dict[int, str]
+    prior: Prior
+    hypotheses: Hypotheses | None
 
 
 def _outlier_probabilities(

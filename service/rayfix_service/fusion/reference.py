@@ -191,6 +191,16 @@ def extend_beam(
     return parent, choice, score[order]
 
 
+def mixture_log_density(points: Array, log_weight: Array, mean: Array, cov: Array) -> Array:
+    """Log density of a Gaussian mixture at points of shape (n, 3), one Gaussian after the other."""
+    total = np.zeros(len(points))
+    for weight, centre, spread in zip(np.exp(log_weight), mean, cov, strict=True):
+        apart = points - centre
+        square = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(spread), apart)
+        total += weight * np.exp(-0.5 * square) / np.sqrt(np.linalg.det(2.0 * np.pi * spread))
+    return np.asarray(np.log(total))
+
+
 def cut_gaussian(mean: Array, cov: Array, points: Array, free_space: FreeSpace) -> tuple[Array, Array, float]:
     """Cut one Gaussian to the free space; returns its mean, covariance and share of points that are free."""
     spread = mean + points @ np.linalg.cholesky(cov).T
