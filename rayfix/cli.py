@@ -94,6 +94,8 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     serve.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
     serve.add_argument("--workers", type=int, default=1, help="processes that answer (default: 1)")
+    serve.add_argument("--log-format", choices=("text", "json"), default="text", help="of the log (default: text)")
+    serve.add_argument("--access-log", action="store_true", help="log a line per request")
 
     mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: angles of Silicon Labs locators in, positions out")
     mqtt.add_argument("table", type=Path, metavar="T.h5")
@@ -254,7 +256,14 @@ def _locate(options: argparse.Namespace) -> int:
 def _serve(options: argparse.Namespace) -> int:
     with needs_extra("service"):
         from rayfix_service.http.server import serve
-    serve(options.table, host=options.host, port=options.port, workers=options.workers)
+    serve(
+        options.table,
+        host=options.host,
+        port=options.port,
+        workers=options.workers,
+        log_format=options.log_format,
+        access_log=options.access_log,
+    )
     return 0
 
 

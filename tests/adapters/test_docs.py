@@ -8,6 +8,7 @@ from typing import Any, cast
 import pytest
 
 from rayfix_service.adapters.formats import InputFormat, OutputFormat, parse, write
+from rayfix_service.adapters.silabs import parse_silabs_angle
 from rayfix_service.fusion.locator import Locator
 from rayfix_tables.table import Table
 
@@ -41,6 +42,11 @@ def test_an_input_is_located(name: str, locator: Locator):
     assert adapted.skipped == ()
     # Their noise is one of about a degree at up to 9 m, or with u-blox half a degree of rounding.
     assert fix.position == pytest.approx([7.0, 4.0, 1.5], abs=0.5)
+
+
+def test_the_payload_for_a_broker_is_an_angle():
+    (payload,) = re.findall(r"mosquitto_pub -t \S+ -m '(.*?)'", PAGE, flags=re.DOTALL)
+    assert parse_silabs_angle(payload.encode()).sequence == 4711
 
 
 def shape_of(document: Any) -> Any:

@@ -1,6 +1,6 @@
 """Joining by hand, and no message lost or used twice."""
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rayfix_service.adapters.joining import Joiner, Transmission
@@ -52,6 +52,7 @@ def test_without_sequence_number_the_window_and_the_stations_decide():
 Message = tuple[str, str, int]
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.sampled_from("tu"), st.sampled_from("abc"), st.integers(0, 3)), max_size=30))
 def test_in_an_endless_window_every_message_comes_out_once(messages: list[Message]):
     joiner: Joiner[int] = Joiner(window=float("inf"))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -86,6 +86,7 @@ def test_the_confidence_is_that_of_the_candidate_and_its_ellipsoid(probability: 
     assert fix_to_3gpp(a_fix(np.eye(3), probability=probability), SITE)["confidence"] == confidence
 
 
+@settings(deadline=None, max_examples=30)
 @given(st.lists(st.floats(-1, 1), min_size=9, max_size=9), st.floats(0.05, 0.99))
 def test_the_ellipsoid_holds_what_it_says(entries: Sequence[float], confidence: float):
     """Against the distribution function on a grid of directions, ten times as fine, by the other formula."""

@@ -4,7 +4,7 @@ import math
 from fractions import Fraction
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rayfix_service.adapters.report_mapping import (
@@ -77,6 +77,7 @@ def test_values_by_hand(value: int, k: int, middle_tc: float):
     assert interval.variance == pytest.approx((float(TC * C) * 2.0**k) ** 2 / 12, rel=1e-12)
 
 
+@settings(deadline=None)
 @given(st.integers(-6, 5), st.fractions(-985024, 985024 - Fraction(1, 10**6)))
 def test_a_time_is_within_half_a_step_of_what_its_value_decodes_to(k: int, in_tc: Fraction):
     interval = time_interval(reported(in_tc * TC, k), k)
@@ -84,6 +85,7 @@ def test_a_time_is_within_half_a_step_of_what_its_value_decodes_to(k: int, in_tc
     assert abs(interval.middle - float(in_tc * TC * C)) <= 0.5 * interval.width * (1 + 1e-6)
 
 
+@settings(deadline=None)
 @given(st.integers(-6, 5), st.data())
 def test_the_middle_of_an_interval_is_reported_as_its_value(k: int, data: st.DataObject):
     value = data.draw(st.integers(1, ASN1_LARGEST[k] - 1))
@@ -92,6 +94,7 @@ def test_the_middle_of_an_interval_is_reported_as_its_value(k: int, data: st.Dat
     assert reported(Fraction(interval.middle) / C, k) == value
 
 
+@settings(deadline=None)
 @given(st.integers(0, 3599))
 def test_angles_are_in_the_middle_of_their_tenth_of_a_degree(value: int):
     interval = angle_interval(value)

@@ -5,7 +5,7 @@ import math
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rayfix_service.adapters.silabs import parse_silabs, parse_silabs_angle
@@ -76,6 +76,7 @@ def test_angles_may_be_of_another_frame():
     assert angle.frame == "scene"
 
 
+@settings(deadline=None)
 @given(st.floats(-360, 360), st.floats(-90, 90))
 def test_the_way_back(azimuth: float, elevation: float):
     angle, _ = parse_silabs(message(without(azimuth=azimuth, elevation=elevation))).report.measurements

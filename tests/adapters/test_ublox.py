@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rayfix_service.adapters.ublox import UudfEvent, parse_ublox, parse_uudf
@@ -55,6 +55,7 @@ def test_real_samples():
     assert azimuths == pytest.approx([-8, 0, -26], abs=1e-9)
 
 
+@settings(deadline=None)
 @given(st.integers(-90, 90), st.integers(-90, 90))
 def test_right_of_the_boresight_is_a_negative_azimuth(azimuth: int, elevation: int):
     (adapted,) = parse_ublox(line("tag", "anchor", azimuth=azimuth, elevation=elevation), stations={"anchor": "bs1"})

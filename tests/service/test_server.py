@@ -29,10 +29,10 @@ REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]
 class ServerProcess:
     """A server in a process of its own, on a free loopback port."""
 
-    def __init__(self, table_path: Path, workers: int) -> None:
+    def __init__(self, table_path: Path, workers: int, options: str = "") -> None:
         code = (
             "import sys; from rayfix_service.http.server import serve; "
-            "serve(sys.argv[1], port=0, workers=int(sys.argv[2]))"
+            f"serve(sys.argv[1], port=0, workers=int(sys.argv[2]), {options})"
         )
         self.process = subprocess.Popen(
             [sys.executable, "-c", code, str(table_path), str(workers)], stderr=subprocess.PIPE, text=True
@@ -132,9 +132,32 @@ def test_several_workers_share_a_port(hall_table_path: Path):
         for _ in range(4):
             with httpx.Client(base_url=base_url, timeout=30, trust_env=False) as http:
                 assert http.post("/v1/positions", json=REPORT).status_code == 200
+        # Whichever worker is asked answers for both.
+        for _ in range(4):
+            with httpx.Client(base_url=base_url, timeout=30, trust_env=False) as http:
+                figures = http.get("/metrics").text
+            assert 'rayfix_http_requests_total{method="POST",route="/v1/positions",status="200"} 4.0' in figures
+            assert "rayfix_ready 1.0" in figures
     finally:
         log = server.stop()
     assert "Traceback" not in log
+
+
+def test_the_log_may_be_json(hall_table_path: Path):
+    server = ServerProcess(hall_table_path, workers=1, options="log_format='json', access_log=True")
+    try:
+        with httpx.Client(base_url=f"http://127.0.0.1:{server.port()}", timeout=30, trust_env=False) as http:
+            server.wait_until_ready(http)
+            assert http.post("/v1/positions", json=REPORT, headers={"x-request-id": "r-1"}).status_code == 200
+    finally:
+        log = server.stop()
+    entries = [json.loads(line) for line in log.splitlines()]
+    assert all(entry.keys() >= {"time", "level", "logger", "message"} for entry in entries)
+    assert any("ready with table" in entry["message"] for entry in entries)
+    (access,) = (entry for entry in entries if entry.get("request_id") == "r-1")
+    assert access["logger"] == "rayfix_service.access"
+    assert (access["method"], access["path"], access["status"]) == ("POST", "/v1/positions", "200")
+    assert 0 < access["seconds"] < 30
 
 
 def test_what_cannot_be_served_is_said_first(hall_table_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

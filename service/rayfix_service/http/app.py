@@ -14,7 +14,9 @@ from rayfix_service.adapters.silabs import SilabsDocument
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.http import routes_formats, routes_health, routes_positions, routes_table
 from rayfix_service.http.dependencies import BodyLimits, Service
+from rayfix_service.http.metrics import Metrics
 from rayfix_service.http.problems import Problem, install_problems
+from rayfix_service.http.request_context import RequestContext
 from rayfix_service.wire import BatchDocument, ReportDocument
 from rayfix_tables.table import Table
 
@@ -66,7 +68,9 @@ def create_app(table_path: Path, *, body_limits: BodyLimits | None = None) -> Fa
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        app.state.service = Service(Locator(Table.open(table_path)))
+        table = Table.open(table_path)
+        app.state.metrics.table_opened(table)
+        app.state.service = Service(Locator(table), on_ready=app.state.metrics.became_ready)
         preparation = asyncio.create_task(app.state.service.prepare())
         try:
             yield
@@ -82,7 +86,9 @@ def create_app(table_path: Path, *, body_limits: BodyLimits | None = None) -> Fa
         redirect_slashes=False,  # a redirected POST loses its body in many clients; a 404 is clear
     )
     app.state.body_limits = body_limits or BodyLimits()
+    app.state.metrics = Metrics()
     install_problems(app)
+    app.add_middleware(RequestContext, metrics=app.state.metrics)  # around all, to see the last resort's answers too
     app.include_router(routes_positions.router)
     app.include_router(routes_formats.router)
     app.include_router(routes_table.router)

@@ -41,9 +41,12 @@ class Service:
     ----------
     locator : Locator
         Of an open table that is not verified yet.
+    on_ready : callable
+        Called once it can locate.
     """
 
-    def __init__(self, locator: Locator) -> None:
+    def __init__(self, locator: Locator, *, on_ready: Callable[[], None]) -> None:
+        self._on_ready = on_ready
         self.ready = False
         self.failure: str | None = None
         self._locator = locator
@@ -61,6 +64,7 @@ class Service:
             _log.critical("not ready", exc_info=True)
         else:
             self.ready = True
+            self._on_ready()
             _log.info("ready with table %s", self._locator.table.table_id)
 
     def locator(self) -> Locator:

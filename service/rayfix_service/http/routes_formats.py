@@ -13,9 +13,9 @@ from rayfix_service.adapters.nrppa import parse_nrppa
 from rayfix_service.adapters.nrppa_documents import NrppaDocument
 from rayfix_service.adapters.silabs import SilabsDocument, parse_silabs
 from rayfix_service.adapters.ublox import parse_ublox
-from rayfix_service.http.dependencies import LinesBody, LocatorDep, ReportBody
+from rayfix_service.http.dependencies import LinesBody, ReportBody
 from rayfix_service.http.examples import NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
-from rayfix_service.http.locating import answer, answer_or_problem
+from rayfix_service.http.locating import AnswererDep
 from rayfix_service.http.outputs import (
     ADAPTED_ANSWER,
     POSITION_PROBLEMS,
@@ -43,9 +43,9 @@ class LinesResult(BaseModel):
     responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(NrppaDocument, NRPPA_EXAMPLES),
 )
-async def post_nrppa(locator: LocatorDep, body: ReportBody, output: Output = "native") -> JSONResponse:
+async def post_nrppa(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JSONResponse:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    return JSONResponse(await answer(locator, parse_nrppa(body), output))
+    return JSONResponse(await answerer.answer(parse_nrppa(body), output))
 
 
 @router.post(
@@ -55,9 +55,9 @@ async def post_nrppa(locator: LocatorDep, body: ReportBody, output: Output = "na
     responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(SilabsDocument, SILABS_EXAMPLES),
 )
-async def post_silabs(locator: LocatorDep, body: ReportBody, output: Output = "native") -> JSONResponse:
+async def post_silabs(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JSONResponse:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    return JSONResponse(await answer(locator, parse_silabs(body), output))
+    return JSONResponse(await answerer.answer(parse_silabs(body), output))
 
 
 @router.post(
@@ -74,7 +74,7 @@ async def post_silabs(locator: LocatorDep, body: ReportBody, output: Output = "n
 )
 async def post_ublox(
     request: Request,
-    locator: LocatorDep,
+    answerer: AnswererDep,
     body: LinesBody,
     output: Output = "native",
     station: Annotated[list[str], Query(description="ANCHOR=STATION, for anchors whose id is no station's")] = [],  # noqa: B006
@@ -84,7 +84,7 @@ async def post_ublox(
     for adapted in parse_ublox(body, stations=station_map(station)):
         if await request.is_disconnected():
             raise ProblemError(CONNECTION_ENDED, "the connection ended before the answer")
-        results.append(await answer_or_problem(locator, partial(_same, adapted), output))
+        results.append(await answerer.answer_or_problem(partial(_same, adapted), output))
         await asyncio.sleep(0)
     return JSONResponse({"results": results})
 

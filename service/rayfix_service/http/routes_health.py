@@ -2,7 +2,8 @@
 
 from typing import Literal
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, Field
 
 from rayfix_service.http.dependencies import LocatorDep
@@ -34,3 +35,10 @@ async def livez() -> Alive:
 async def readyz(locator: LocatorDep) -> Ready:
     """Answer 200 once the table is checked and the kernels are compiled, and 503 before."""
     return Ready(table_id=locator.table.table_id)
+
+
+@router.get("/metrics", summary="Figures for Prometheus", response_class=PlainTextResponse)
+async def metrics(request: Request) -> Response:
+    """Tell how many requests and fixes there were, how long they took, and which table answers."""
+    text, media_type = request.app.state.metrics.exposition(request.headers.get("accept", ""))
+    return Response(text, headers={"content-type": media_type})

@@ -9,9 +9,9 @@ from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
-from rayfix_service.http.dependencies import BatchBody, LocatorDep, ReportBody
+from rayfix_service.http.dependencies import BatchBody, ReportBody
 from rayfix_service.http.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
-from rayfix_service.http.locating import answer, answer_or_problem
+from rayfix_service.http.locating import AnswererDep
 from rayfix_service.http.outputs import NATIVE_ANSWER, POSITION_PROBLEMS, NativeOrOther, Output, request_body
 from rayfix_service.http.problems import CONNECTION_ENDED, Problem, ProblemError
 from rayfix_service.wire import (
@@ -46,9 +46,9 @@ class BatchResult(BaseModel):
     responses={**NATIVE_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(ReportDocument, REPORT_EXAMPLES),
 )
-async def post_position(locator: LocatorDep, body: ReportBody, output: Output = "native") -> JSONResponse:
+async def post_position(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JSONResponse:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
-    return JSONResponse(await answer(locator, parse_report(body), output))
+    return JSONResponse(await answerer.answer(parse_report(body), output))
 
 
 @router.post(
@@ -58,7 +58,9 @@ async def post_position(locator: LocatorDep, body: ReportBody, output: Output = 
     responses=POSITION_PROBLEMS,
     openapi_extra=request_body(BatchDocument, BATCH_EXAMPLES),
 )
-async def post_batch(request: Request, locator: LocatorDep, body: BatchBody, output: Output = "native") -> JSONResponse:
+async def post_batch(
+    request: Request, answerer: AnswererDep, body: BatchBody, output: Output = "native"
+) -> JSONResponse:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
     documents = _batch_reports(read_json(body))
     results: list[dict[str, Any]] = []
@@ -67,7 +69,7 @@ async def post_batch(request: Request, locator: LocatorDep, body: BatchBody, out
         if await request.is_disconnected():
             _log.info("batch given up after %d of %d reports: the client left", len(results), len(documents))
             raise ProblemError(CONNECTION_ENDED, "the connection ended before the answer")
-        results.append(await answer_or_problem(locator, partial(parse_report, document), output))
+        results.append(await answerer.answer_or_problem(partial(parse_report, document), output))
         await asyncio.sleep(0)  # a thousand fixes take a second: let other requests in between
     return JSONResponse({"results": results})
 

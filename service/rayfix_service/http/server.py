@@ -1,16 +1,17 @@
 """Serve a table over HTTP."""
 
-import copy
 import os
 import socket
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
 
 import uvicorn
-import uvicorn.config
 from fastapi import FastAPI
 
 from rayfix_service.http.app import create_app
+from rayfix_service.http.logs import LogFormat, log_config
+from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table
 
@@ -24,7 +25,15 @@ class ServiceError(RayfixError):
     """The service cannot start."""
 
 
-def serve(table_path: str | Path, *, host: str = "127.0.0.1", port: int = 8000, workers: int = 1) -> None:
+def serve(
+    table_path: str | Path,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    workers: int = 1,
+    log_format: LogFormat = "text",
+    access_log: bool = False,
+) -> None:
     """Serve a table until the process is told to end (SIGINT, SIGTERM); requests under way are finished.
 
     Parameters
@@ -37,6 +46,10 @@ def serve(table_path: str | Path, *, host: str = "127.0.0.1", port: int = 8000, 
         TCP port; 0 takes a free one, which the log names.
     workers : int
         Processes that share the port and, since they map it, the memory of the table.
+    log_format : {"text", "json"}
+        JSON is an object a line.
+    access_log : bool
+        Whether to log a line per request. It costs more than it tells, with a hundred targets at 5 Hz.
 
     Raises
     ------
@@ -50,21 +63,26 @@ def serve(table_path: str | Path, *, host: str = "127.0.0.1", port: int = 8000, 
         raise ServiceError(f"workers is {workers}; give at least 1")
     Table.open(path).verify()
     check_address(host, port)
-    app: str | FastAPI = f"{__name__}:{app_from_environment.__name__}"
-    if workers > 1:
-        os.environ[TABLE_VARIABLE] = str(path)
-    else:
-        app = create_app(path)
-    uvicorn.run(
-        app,
-        factory=workers > 1,
-        host=host,
-        port=port,
-        workers=workers,
-        timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
-        access_log=False,  # a line per fix costs more than it tells, with a hundred targets at 5 Hz
-        log_config=_log_config(),
-    )
+    with ExitStack() as stack:
+        app: str | FastAPI = f"{__name__}:{app_from_environment.__name__}"
+        if workers > 1:
+            os.environ[TABLE_VARIABLE] = str(path)
+            if MULTIPROCESS_VARIABLE not in os.environ:
+                # Where the workers share their figures; whichever is asked answers for all.
+                os.environ[MULTIPROCESS_VARIABLE] = stack.enter_context(TemporaryDirectory(prefix="rayfix-metrics-"))
+                stack.callback(os.environ.pop, MULTIPROCESS_VARIABLE)
+        else:
+            app = create_app(path)
+        uvicorn.run(
+            app,
+            factory=workers > 1,
+            host=host,
+            port=port,
+            workers=workers,
+            timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
+            access_log=False,  # this package has one of its own
+            log_config=log_config(log_format, access_log=access_log),
+        )
 
 
 def app_from_environment() -> FastAPI:
@@ -109,10 +127,3 @@ def check_address(host: str, port: int) -> None:
             raise ServiceError(
                 f"cannot listen on {host} port {port} ({error.strerror}); end what uses it or give another"
             ) from None
-
-
-def _log_config() -> dict[str, Any]:
-    """Extend uvicorn's logging to the messages of this package."""
-    config = copy.deepcopy(uvicorn.config.LOGGING_CONFIG)
-    config["loggers"]["rayfix_service"] = {"handlers": ["default"], "level": "INFO", "propagate": False}
-    return config

@@ -1,0 +1,96 @@
+"""Figures for Prometheus; docs/operations.md lists them."""
+
+import os
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.multiprocess import MultiProcessCollector
+
+from rayfix_service.fusion.report import Fix
+from rayfix_tables.table import Table
+
+MULTIPROCESS_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
+"""Environment variable of prometheus-client: folder where several processes share their figures."""
+
+_METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
+_SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+
+
+class Metrics:
+    """The figures of one application, in a registry of its own."""
+
+    def __init__(self) -> None:
+        self._registry = CollectorRegistry()
+        self._requests = Counter(
+            "rayfix_http_requests",
+            "HTTP requests by route, method and status",
+            ("route", "method", "status"),
+            registry=self._registry,
+        )
+        self._request_seconds = Histogram(
+            "rayfix_http_request_seconds",
+            "Time from a request's head to the end of its answer",
+            ("route", "method"),
+            buckets=_SECONDS,
+            registry=self._registry,
+        )
+        self._fixes = Counter("rayfix_fixes", "Fixes by status", ("status",), registry=self._registry)
+        self._fusion_seconds = Histogram(
+            "rayfix_fusion_seconds", "Time that a fix took to compute", buckets=_SECONDS, registry=self._registry
+        )
+        self._measurements = Counter(
+            "rayfix_measurements",
+            "Measurements by what became of them: used, outlier (used, and more likely wrong than not) or unused",
+            ("outcome",),
+            registry=self._registry,
+        )
+        self._table = Gauge(
+            "rayfix_table_info",
+            "1 for the table that answers",
+            ("table_id", "site", "format_version", "software_version"),
+            registry=self._registry,
+            multiprocess_mode="max",
+        )
+        self._ready = Gauge(
+            "rayfix_ready", "1 once the service can locate", registry=self._registry, multiprocess_mode="min"
+        )
+        ProcessCollector(registry=self._registry)
+
+    def request_done(self, route: str, method: str, status: str, seconds: float) -> None:
+        """Count a request."""
+        method = method if method in _METHODS else "other"
+        self._requests.labels(route, method, status).inc()
+        self._request_seconds.labels(route, method).observe(seconds)
+
+    def fix_done(self, fix: Fix, seconds: float) -> None:
+        """Count a fix and its measurements."""
+        self._fixes.labels(fix.status).inc()
+        self._fusion_seconds.observe(seconds)
+        for outcome in fix.outcomes:
+            name = "unused" if not outcome.used else "outlier" if (outcome.outlier_probability or 0) > 0.5 else "used"
+            self._measurements.labels(name).inc()
+
+    def table_opened(self, table: Table) -> None:
+        """Tell which table answers."""
+        names = (table.table_id, table.site.name, str(table.format_version), table.software_version)
+        self._table.labels(*names).set(1)
+        self._ready.set(0)
+
+    def became_ready(self) -> None:
+        """Tell that the service can locate."""
+        self._ready.set(1)
+
+    def exposition(self, accept: str) -> tuple[bytes, str]:
+        """Write all figures, those of the other worker processes included; returns text and media type.
+
+        Parameters
+        ----------
+        accept : str
+            The request's Accept header.
+        """
+        registry = self._registry
+        if MULTIPROCESS_VARIABLE in os.environ:
+            registry = CollectorRegistry()
+            MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
+        encode, media_type = choose_encoder(accept)
+        return encode(registry), media_type
