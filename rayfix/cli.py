@@ -57,6 +57,7 @@ def _parser() -> argparse.ArgumentParser:
 
     check = add("check", _check, "list the problems of a site and its scene, each with its remedy")
     check.add_argument("site", type=Path, metavar="SITE.toml")
+    check.add_argument("--json", action="store_true", help="as JSON")
 
     build = add("build", _build, "build the table of a site")
     build.add_argument("site", type=Path, metavar="SITE.toml")
@@ -169,19 +170,16 @@ def _example(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace) -> int:
     with needs_extra("offline"):
-        from rayfix_offline.site import read_site
-        from rayfix_offline.twin import prepare_twin
-    twin = prepare_twin(read_site(options.site), options.site.parent)
-    for finding in twin.findings:
-        print(f"{finding.severity}: {finding.message}")
-    errors = sum(finding.severity == "error" for finding in twin.findings)
-    warnings = len(twin.findings) - errors
-    size = " x ".join(f"{length:.6g}" for length in twin.scene.bounds[1] - twin.scene.bounds[0])
-    print(
-        f"{options.site}: scene of {size} m with {len(twin.scene.faces):,} triangles on {len(twin.planes):,} planes, "
-        f"{twin.free_space.volume:,.0f} m3 of free space; {errors} errors, {warnings} warnings"
-    )
-    return 2 if errors else 0
+        from rayfix_offline.check import check_site
+
+    from rayfix.console import print_check
+
+    check = check_site(options.site)
+    if options.json:
+        print(json.dumps(check.document(), indent=2))
+    else:
+        print_check(check)
+    return 2 if check.num_errors else 0
 
 
 def _build(options: argparse.Namespace) -> int:

@@ -1,5 +1,6 @@
 """What the command line shows: progress bars, summaries, tables and fixes."""
 
+import textwrap
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,7 @@ from rayfix_tables.update import Update
 if TYPE_CHECKING:
     from rayfix_offline.build import BuildSummary
     from rayfix_offline.build import Progress as BuildProgress
+    from rayfix_offline.check import Check
 
 
 @contextmanager
@@ -52,6 +54,28 @@ def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
         yield show
     finally:
         bar.stop()
+
+
+def print_check(check: "Check") -> None:
+    """Print a line per finding, one on the rays that are lost and one for the whole; a terminal gets them wrapped."""
+    lines = [f"{finding.severity}: {finding.message}" for finding in check.findings]
+    twin = check.twin
+    if check.escapes:
+        lost = ", ".join(f"{escapes.station_id} {escapes.share:.2%}" for escapes in check.escapes)
+        lines.append(f"rays that leave the scene: {lost}")
+    size = " x ".join(f"{length:.6g}" for length in twin.scene.bounds[1] - twin.scene.bounds[0])
+    curved = f" in {twin.planes.num_surfaces:,} surfaces" if twin.planes.curved else ""
+    lines.append(
+        f"{check.site_path}: scene of {size} m with {len(twin.scene.faces):,} triangles on {len(twin.planes):,} planes"
+        f"{curved}, {twin.free_space.volume:,.0f} m3 of free space; {check.num_errors} errors, "
+        f"{len(check.findings) - check.num_errors} warnings"
+    )
+    console = Console()
+    for line in lines:
+        wrapped = textwrap.fill(
+            line, min(100, console.width), subsequent_indent="    ", break_long_words=False, break_on_hyphens=False
+        )
+        print(wrapped if console.is_terminal else line)
 
 
 def print_build_summary(summary: "BuildSummary") -> None:

@@ -36,9 +36,14 @@ class Planes:
     surfaces: NDArray[np.int32]
 
     @property
+    def num_surfaces(self) -> int:
+        """Number of surfaces."""
+        return int(self.surfaces.max(initial=-1)) + 1
+
+    @property
     def curved(self) -> bool:
         """Whether planes have a surface in common."""
-        return len(self.surfaces) > 0 and int(self.surfaces.max()) + 1 < len(self)
+        return self.num_surfaces < len(self)
 
     def __len__(self) -> int:
         """Return the number of planes."""

@@ -6,7 +6,7 @@ import io
 import logging
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,8 @@ class Scene:
         Index into ``objects``, the names of the file's meshes.
     num_degenerate : int
         Triangles without an area, left out.
+    says_up : bool
+        The file itself said which axis points up.
     """
 
     vertices: NDArray[np.float64]
@@ -57,6 +59,7 @@ class Scene:
     face_objects: NDArray[np.int32]
     objects: tuple[str, ...]
     num_degenerate: int = 0
+    says_up: bool = False
 
     @cached_property
     def triangles(self) -> NDArray[np.float64]:
@@ -100,23 +103,23 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
     kind = path.suffix.lower().lstrip(".")
     if kind not in FILE_TYPES:
         raise SceneError(f"{path} is of unknown type '{kind}'; give one of {', '.join(FILE_TYPES)}")
-    scale = METRES_PER_UNIT[unit]
+    scale, said_up = METRES_PER_UNIT[unit], None
     if kind == "xml":
         meshes = read_mitsuba(path, _load_quietly)
     elif kind == "ifc":
-        meshes, scale, up = read_ifc(path), 1.0, "z"
+        meshes, scale, said_up = read_ifc(path), 1.0, "z"
     else:
         loaded = _load_quietly(path)
         meshes = _placed_meshes(loaded)
         if kind == "dae":
             # trimesh reads the unit of a COLLADA file (as "0.01 * meters"), but does not apply it.
             scale = float(unit_conversion(loaded.units, "meters"))
-            up = _collada_up(path) or up
+            said_up = _collada_up(path)
     if not meshes:
         raise SceneError(f"{path} holds no triangles; export the scene as a triangle mesh")
     if not all(np.isfinite(mesh.vertices).all() and np.isfinite(transform).all() for _, mesh, transform in meshes):
         raise SceneError(f"{path} has coordinates that are not finite; export the scene again")
-    scene = _gather(meshes, scale=scale, up=up)
+    scene = replace(_gather(meshes, scale=scale, up=said_up or up), says_up=said_up is not None)
     if not len(scene.faces):
         raise SceneError(f"{path} has only triangles without an area; export the scene again")
     return scene

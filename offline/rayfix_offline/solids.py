@@ -1,5 +1,6 @@
 """Closed parts of the scene: solids, in which nothing can be, and enclosures, outside of which nothing can be."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from trimesh.triangles import closest_point
 
 from rayfix_offline.scene import Scene
@@ -19,8 +21,6 @@ MAX_VOXELS = 20_000_000
 TOUCH = 1e-3
 """Whatever is nearer to a surface lies on it, m."""
 
-_ENCLOSURE_SHARE = 0.05
-
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
@@ -29,55 +29,88 @@ class Part:
     Attributes
     ----------
     name : str
-        Object of the scene file that it (mostly) belongs to.
+        Object of the scene file that it (mostly) belongs to; numbered where an object has several parts.
     faces : ndarray of int64, shape (n,)
         Its triangles in the scene.
     closed : bool
         Every edge belongs to an even number of triangles, so that it has an inside.
     consistent : bool
         Every edge is run through once in each direction, so that all triangles face the same way.
+    manifold : bool
+        No edge belongs to more than two triangles.
     volume : float, m3
         Signed: positive where the triangles face outwards.
+    middle : tuple of float, m
+        Mean of its triangles' centres.
     """
 
     name: str
     faces: NDArray[np.int64]
     closed: bool
     consistent: bool
+    manifold: bool
     volume: float
+    middle: tuple[float, float, float]
 
 
 def split_parts(scene: Scene, topology: Topology) -> tuple[Part, ...]:
-    """Cut the scene into connected parts."""
-    label = topology.components()
-    count = int(label.max()) + 1
-    order = np.argsort(label, kind="stable")
-    sizes = np.bincount(label, minlength=count)
-    offsets = np.concatenate([[0], np.cumsum(sizes)])
+    """Cut the scene into connected parts, in the order of their first triangles.
 
-    def all_of(condition: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        return np.asarray(np.bincount(label, weights=~condition, minlength=count) == 0)
+    What hangs together within an object and is closed is a part. The rest hangs together across objects: a room may
+    be drawn as six sheets.
+    """
+    label = topology.components(scene.face_objects)
+    odd = (topology.uses_within(label)[0] % 2 == 1).any(axis=1)
+    loose = np.flatnonzero((np.bincount(label, weights=odd) > 0)[label])
+    label[loose] = label.max() + 1 + topology.components(np.zeros(len(scene.faces), np.int64), among=loose)
+    _, first, label = np.unique(label, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    label = rank[label.reshape(-1)]
+    count = len(first)
 
-    closed = all_of((topology.edge_uses % 2 == 0)[topology.edges].all(axis=1))
-    consistent = all_of((topology.edge_balance == 0)[topology.edges].all(axis=1))
+    def total(values: NDArray[Any]) -> NDArray[np.float64]:
+        return np.asarray(np.bincount(label, weights=values, minlength=count), np.float64)
+
+    uses, balance = topology.uses_within(label)
     # About the part's own middle: far from the origin, the triangles' shares would cancel.
-    middle = np.stack([np.bincount(label, weights=m) for m in scene.triangles.mean(axis=1).T], axis=1) / sizes[:, None]
+    sizes = total(np.ones(len(label)))
+    middle = np.stack([total(m) for m in scene.triangles.mean(axis=1).T], axis=1) / sizes[:, None]
     a, b, c = (scene.triangles[:, i] - middle[label] for i in range(3))
-    volume = np.bincount(label, weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0, minlength=count)
-    # The object that most triangles of the part belong to.
-    pairs, uses = np.unique(label * len(scene.objects) + scene.face_objects, return_counts=True)
-    best = pairs[np.lexsort((-uses, pairs // len(scene.objects)))]
-    names = best[np.unique(best // len(scene.objects), return_index=True)[1]] % len(scene.objects)
+    volume = total(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
+    faces = np.split(np.argsort(label, kind="stable"), np.cumsum(sizes.astype(np.int64))[:-1])
+    open_sides = total((uses % 2 == 1).sum(axis=1))
+    crowded_sides = total((uses > 2).sum(axis=1))
+    turned_sides = total((balance != 0).sum(axis=1))
+    names = _names(scene, label, count)
     return tuple(
         Part(
-            name=scene.objects[names[part]],
-            faces=order[offsets[part] : offsets[part + 1]],
-            closed=bool(closed[part]),
-            consistent=bool(consistent[part]),
+            name=names[part],
+            faces=faces[part],
+            closed=open_sides[part] == 0,
+            consistent=turned_sides[part] == 0,
+            manifold=crowded_sides[part] == 0,
             volume=float(volume[part]),
+            middle=(float(middle[part, 0]), float(middle[part, 1]), float(middle[part, 2])),
         )
         for part in range(count)
     )
+
+
+def _names(scene: Scene, label: NDArray[np.int64], count: int) -> list[str]:
+    """Names of parts: the object that most of their triangles belong to, numbered where it has several."""
+    pairs, uses = np.unique(label * len(scene.objects) + scene.face_objects, return_counts=True)
+    part, named = pairs // len(scene.objects), pairs % len(scene.objects)
+    order = np.lexsort((-uses, part))
+    most = named[order[np.unique(part[order], return_index=True)[1]]]
+    names = [scene.objects[k] for k in most]
+    times = Counter(names)
+    seen: Counter[str] = Counter()
+    for n in range(count):
+        if times[names[n]] > 1:
+            seen[names[n]] += 1
+            names[n] = f"{names[n]} #{seen[names[n]]}"
+    return names
 
 
 def is_inside(triangles: NDArray[np.float64], point: NDArray[np.float64]) -> bool:
@@ -120,50 +153,24 @@ def touched(triangles: NDArray[np.float64], point: NDArray[np.float64]) -> int:
     int
         Index of the triangle, -1 for none.
     """
-    distance = np.linalg.norm(closest_point(triangles, np.broadcast_to(point, (len(triangles), 3))) - point, axis=1)
+    near = np.flatnonzero(
+        np.all((triangles.min(axis=1) <= point + TOUCH) & (triangles.max(axis=1) >= point - TOUCH), axis=1)
+    )
+    if not len(near):
+        return -1
+    closest = closest_point(triangles[near], np.broadcast_to(point, (len(near), 3)))
+    distance = np.linalg.norm(closest - point, axis=1)
     nearest = int(distance.argmin())
-    return nearest if distance[nearest] < TOUCH else -1
+    return int(near[nearest]) if distance[nearest] < TOUCH else -1
 
 
-def find_enclosures(
-    scene: Scene, parts: Sequence[Part], stations: NDArray[np.float64]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Tell which closed parts enclose the site, and which stations lie in which parts.
-
-    A part that holds more than half of the stations and a good share of the scene's volume is the building itself (or
-    the inner or outer face of its walls); every other closed part is a solid.
+def map_free_space(scene: Scene, *, solids: Sequence[Part], rooms: Sequence[Part], voxel_size: float) -> FreeSpace:
+    """Mark the voxels whose centres lie outside all solids and, where there are rooms, inside one.
 
     Parameters
     ----------
-    stations : ndarray of shape (n_stations, 3), m
-
-    Returns
-    -------
-    enclosing : ndarray of bool, shape (n_parts,)
-    inside : ndarray of bool, shape (n_parts, n_stations)
-        Or on the part's surface.
-    """
-    scene_volume = float(np.prod(np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)))
-    inside = np.zeros((len(parts), len(stations)), bool)
-    enclosing = np.zeros(len(parts), bool)
-    for i, part in enumerate(parts):
-        if not part.closed:
-            continue
-        triangles = scene.triangles[part.faces]
-        low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-        for s in np.flatnonzero(np.all((stations >= low - TOUCH) & (stations <= high + TOUCH), axis=1)):
-            inside[i, s] = is_inside(triangles, stations[s]) or touched(triangles, stations[s]) >= 0
-        enclosing[i] = inside[i].mean() > 0.5 and abs(part.volume) > _ENCLOSURE_SHARE * scene_volume
-    return enclosing, inside
-
-
-def map_free_space(
-    scene: Scene, parts: Sequence[Part], enclosing: NDArray[np.bool_], *, voxel_size: float
-) -> FreeSpace:
-    """Mark the voxels whose centres lie inside all enclosures and outside all solids.
-
-    Parameters
-    ----------
+    solids, rooms : sequence of Part
+        Closed parts.
     voxel_size : float, m
         Grows when the scene would take more than MAX_VOXELS.
     """
@@ -171,22 +178,39 @@ def map_free_space(
     extent = np.maximum(high - low, voxel_size)
     voxel_size = max(voxel_size, float((np.prod(extent) / MAX_VOXELS) ** (1.0 / 3.0)))
     shape = tuple(int(n) for n in np.ceil(extent / voxel_size - 1e-9))
-    free = np.ones(shape, bool)
-    for part, encloses in zip(parts, enclosing, strict=True):
-        if part.closed:
-            triangles = scene.triangles[part.faces]
-            reach = (np.stack([triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))]) - low) / voxel_size
-            first, stop = np.floor(reach[0]).astype(np.int64), np.ceil(reach[1]).astype(np.int64) + 1
-            block = tuple(slice(a, b) for a, b in zip(first, stop, strict=True))
-            parity = np.zeros(free[block].shape, bool)
-            _flip_above(triangles, low + first * voxel_size, voxel_size, parity)
-            if encloses:
-                inside = np.zeros(shape, bool)
-                inside[block] = parity
-                free &= inside
-            else:
-                free[block] &= ~parity
+    free = np.full(shape, not rooms)
+    for part in (*rooms, *solids):
+        triangles = scene.triangles[part.faces]
+        reach = (np.stack([triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))]) - low) / voxel_size
+        first, stop = np.floor(reach[0]).astype(np.int64), np.ceil(reach[1]).astype(np.int64) + 1
+        block = tuple(slice(a, b) for a, b in zip(first, stop, strict=True))
+        parity = np.zeros(free[block].shape, bool)
+        _flip_above(triangles, low + first * voxel_size, voxel_size, parity)
+        if any(part is room for room in rooms):
+            free[block] |= parity
+        else:
+            free[block] &= ~parity
     return FreeSpace(origin=low, voxel_size=voxel_size, free=free)
+
+
+def sealed_space(free_space: FreeSpace, stations: NDArray[np.float64]) -> FreeSpace | None:
+    """Cut the free space down to what the stations reach, where solids, such as walls, seal that off.
+
+    Returns
+    -------
+    FreeSpace or None
+        None where a way leads from a station to the border of the scene.
+    """
+    index = np.floor((stations - free_space.origin) / free_space.voxel_size).astype(np.int64)
+    held = np.all((index >= 0) & (index < free_space.free.shape), axis=1)
+    region, _ = ndimage.label(free_space.free)
+    reached = np.setdiff1d(region[tuple(index[held].T)], 0)
+    if not len(reached):
+        return None
+    border = [region.take(end, axis=axis) for axis in range(3) for end in (0, -1)]
+    if any(np.isin(side, reached).any() for side in border):
+        return None
+    return FreeSpace(origin=free_space.origin, voxel_size=free_space.voxel_size, free=np.isin(region, reached))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -23,16 +23,10 @@ class Topology:
         Point at each corner of each triangle.
     edges : ndarray of int64, shape (n_faces, 3)
         Edge of each side of each triangle; side k runs from corner k to the next.
-    edge_uses : ndarray of int64, shape (n_edges,)
-        Triangles that have the edge.
-    edge_balance : ndarray of int64, shape (n_edges,)
-        How many more triangles run through the edge one way than the other; 0 where they face the same way.
     """
 
     points: NDArray[np.int64]
     edges: NDArray[np.int64]
-    edge_uses: NDArray[np.int64]
-    edge_balance: NDArray[np.int64]
 
     def neighbours(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Sides that two triangles, and no third, have in common.
@@ -42,16 +36,54 @@ class Topology:
         first, second : ndarray of int64, shape (n_pairs,)
             Sides of the one and of the other triangle: triangle k // 3, its side k % 3.
         """
-        order = np.argsort(self.edges.reshape(-1), kind="stable")
-        paired = order[self.edge_uses[self.edges.reshape(-1)[order]] == 2]
+        sides = self.edges.reshape(-1)
+        order = np.argsort(sides, kind="stable")
+        paired = order[np.bincount(sides)[sides[order]] == 2]
         return paired[0::2], paired[1::2]
 
-    def components(self) -> NDArray[np.int64]:
-        """Return the connected part of each triangle, shape (n_faces,); triangles hang together at points."""
-        links = np.concatenate([self.points[:, [0, 1]], self.points[:, [1, 2]]])
-        count = int(self.points.max()) + 1
-        label = connect(links, count)[self.points[:, 0]]
-        return np.unique(label, return_inverse=True)[1].reshape(-1)
+    def components(self, groups: NDArray[np.integer], *, among: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """Label the connected parts of triangles; they hang together at points, within their group.
+
+        Parameters
+        ----------
+        groups : ndarray of int, shape (n_faces,)
+        among : ndarray of int, optional
+            Triangles to look at; all when left out.
+
+        Returns
+        -------
+        ndarray of int64, shape (n_faces,) or (len(among),)
+        """
+        points = self.points if among is None else self.points[among]
+        group = groups if among is None else groups[among]
+        if not len(points):
+            return np.zeros(0, np.int64)
+        keys = points * (int(group.max()) + 1) + np.asarray(group, np.int64)[:, None]
+        nodes, at = np.unique(keys, return_inverse=True)
+        at = at.reshape(points.shape)
+        label = connect(np.concatenate([at[:, [0, 1]], at[:, [1, 2]]]), len(nodes))
+        return np.asarray(label[at[:, 0]])
+
+    def uses_within(self, groups: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Count how triangles of a group use the edges.
+
+        Parameters
+        ----------
+        groups : ndarray of int, shape (n_faces,)
+
+        Returns
+        -------
+        uses : ndarray of int64, shape (n_faces, 3)
+            Triangles of the same group that have the side's edge, the triangle itself included.
+        balance : ndarray of int64, shape (n_faces, 3)
+            How many more of them run through the edge one way than the other; 0 where they face the same way.
+        """
+        keys = self.edges * (int(groups.max()) + 1) + np.asarray(groups, np.int64)[:, None]
+        _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+        inverse = inverse.reshape(-1)
+        forward = self.points < np.roll(self.points, -1, axis=1)
+        balance = np.bincount(inverse, weights=np.where(forward.reshape(-1), 1.0, -1.0)).astype(np.int64)
+        return counts[inverse].reshape(keys.shape), np.abs(balance)[inverse].reshape(keys.shape)
 
 
 def connect(links: NDArray[np.int64], count: int) -> NDArray[np.int64]:
@@ -74,16 +106,14 @@ def connect(links: NDArray[np.int64], count: int) -> NDArray[np.int64]:
 
 def find_topology(scene: Scene) -> Topology:
     """Weld the corners of a scene's triangles and find their edges."""
-    _, welded = np.unique(np.round(scene.vertices / WELD), axis=0, return_inverse=True)
-    points = welded.reshape(-1)[scene.faces].astype(np.int64)
-    starts, ends = points.reshape(-1), np.roll(points, -1, axis=1).reshape(-1)
-    # One number instead of two for each edge: sorting pairs takes several times as long.
-    keys = np.minimum(starts, ends) * (int(points.max()) + 1) + np.maximum(starts, ends)
-    _, edges, uses = np.unique(keys, return_inverse=True, return_counts=True)
-    edges = edges.reshape(-1)
-    return Topology(
-        points=points,
-        edges=edges.reshape(points.shape),
-        edge_uses=uses,
-        edge_balance=np.bincount(edges, weights=np.where(starts < ends, 1.0, -1.0)).astype(np.int64),
-    )
+    # Axis by axis, for sorting numbers takes a fraction of the time of sorting rows.
+    welded = np.zeros(len(scene.vertices), np.int64)
+    for axis in range(3):
+        _, place = np.unique(np.round(scene.vertices[:, axis] / WELD), return_inverse=True)
+        _, welded = np.unique(welded * (int(place.max()) + 1) + place.reshape(-1), return_inverse=True)
+        welded = welded.reshape(-1)
+    points = welded[scene.faces]
+    ends = np.roll(points, -1, axis=1)
+    keys = np.minimum(points, ends) * (int(points.max()) + 1) + np.maximum(points, ends)
+    edges = np.unique(keys, return_inverse=True)[1].reshape(points.shape)
+    return Topology(points=points, edges=edges)

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rayfix_offline import solids
+from rayfix_offline.enclosures import find_enclosures
 from rayfix_offline.scene import Scene
-from rayfix_offline.solids import Part, find_enclosures, is_inside, map_free_space, split_parts, touched
+from rayfix_offline.solids import Part, is_inside, map_free_space, split_parts, touched
 from rayfix_offline.topology import find_topology
+from rayfix_tables.freespace import FreeSpace
 
 Box = Callable[..., NDArray[np.float64]]
 seeds = st.integers(0, 2**32 - 1)
@@ -83,8 +85,10 @@ def test_one_turned_triangle(box: Box) -> None:
 
 def test_boxes_that_touch_along_an_edge_are_one_closed_part(box: Box) -> None:
     """Four triangles meet at the common edge."""
-    (part,) = parts_of(scene_of(a=box((0, 0, 0), (1, 1, 1)), b=box((1, 1, 0), (3, 2, 1))))
-    assert (part.closed, part.consistent) == (True, True)
+    one, other = box((0, 0, 0), (1, 1, 1)), box((1, 1, 0), (3, 2, 1))
+    assert [part.closed for part in parts_of(scene_of(a=one, b=other))] == [True, True]
+    (part,) = parts_of(scene_of(ab=np.concatenate([one, other])))
+    assert (part.closed, part.consistent, part.manifold) == (True, True, False)
     assert part.volume == pytest.approx(3.0, rel=1e-12)
 
 
@@ -191,9 +195,9 @@ def test_touching_a_box(box: Box, seed: int) -> None:
 def enclosures(scene: Scene, *stations: tuple[float, float, float]) -> tuple[dict[str, bool], dict[str, list[bool]]]:
     """Give which named parts enclose, and which stations are in which parts."""
     parts = parts_of(scene)
-    enclosing, inside = find_enclosures(scene, parts, np.array(stations))
+    found = find_enclosures(scene, parts, np.array(stations))
     names = [part.name for part in parts]
-    return dict(zip(names, enclosing.tolist(), strict=True)), dict(zip(names, inside.tolist(), strict=True))
+    return dict(zip(names, found.enclosing.tolist(), strict=True)), dict(zip(names, found.inside.tolist(), strict=True))
 
 
 STATIONS = ((3.6, 0.4, 2.6), (0.2, 4.8, 2.6), (2.0, 2.5, 2.6))
@@ -238,11 +242,22 @@ def test_an_open_room_encloses_nothing(clutter: NDArray[np.float64]) -> None:
 # Free space
 
 
+def mapped(scene: Scene, enclosing: list[bool], voxel_size: float) -> FreeSpace:
+    """Map the free space of a scene, its parts as rooms or solids."""
+    parts = [(part, encloses) for part, encloses in zip(parts_of(scene), enclosing, strict=True) if part.closed]
+    return map_free_space(
+        scene,
+        solids=[part for part, encloses in parts if not encloses],
+        rooms=[part for part, encloses in parts if encloses],
+        voxel_size=voxel_size,
+    )
+
+
 def free_space(
     scene: Scene, *, enclosing: list[bool], voxel_size: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Give the map and its voxels' centres."""
-    space = map_free_space(scene, parts_of(scene), np.array(enclosing), voxel_size=voxel_size)
+    space = mapped(scene, enclosing, voxel_size)
     index = np.stack(np.meshgrid(*(np.arange(n) for n in space.free.shape), indexing="ij"), axis=-1)
     return space.free, space.origin + (index + 0.5) * space.voxel_size
 
@@ -314,7 +329,7 @@ def test_an_open_part_is_not_solid(clutter: NDArray[np.float64]) -> None:
 def test_a_large_scene_gets_larger_voxels(box: Box, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solids, "MAX_VOXELS", 10_000)
     scene = scene_of(hall=box((0, 0, 0), (80, 180, 25)))
-    space = map_free_space(scene, parts_of(scene), np.array([True]), voxel_size=0.1)
+    space = mapped(scene, [True], 0.1)
     assert space.free.size <= 10_000 * 1.5  # every axis is rounded up
     assert space.voxel_size == pytest.approx((80 * 180 * 25 / 10_000) ** (1 / 3), rel=1e-12)
     # Voxels that reach beyond the hall count where their centre lies within.
@@ -323,7 +338,7 @@ def test_a_large_scene_gets_larger_voxels(box: Box, monkeypatch: pytest.MonkeyPa
 
 def test_a_flat_scene_has_a_layer_of_voxels() -> None:
     scene = scene_of(floor=np.array([[(0, 0, 0), (1, 0, 0), (1, 1, 0)]], dtype=float))
-    assert map_free_space(scene, parts_of(scene), np.array([False]), voxel_size=0.1).free.shape == (10, 10, 1)
+    assert mapped(scene, [False], 0.1).free.shape == (10, 10, 1)
 
 
 def test_vertices_that_are_shared_or_not_make_no_difference(room: NDArray[np.float64]) -> None:

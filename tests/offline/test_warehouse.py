@@ -74,7 +74,7 @@ def test_a_station_in_a_rack_is_refused(site: SiteFile, site_path: Path) -> None
     twin = prepare_twin(site.model_copy(update={"stations": (*site.stations, station)}), site_path.parent)
     errors = [finding.message for finding in twin.findings if finding.severity == "error"]
     assert errors == [
-        "station 'bs7' at (-6, 0, 4) m lies inside the solid 'warehouse_collision.ply'; move it into free space"
+        "station 'bs7' at (-6, 0, 4) m lies inside the solid 'warehouse_collision.ply #1'; move it into free space"
     ]
 
 

@@ -1,0 +1,106 @@
+"""``rayfix check``: everything that is wrong with a site and its scene, at once."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rayfix_offline.findings import Finding
+from rayfix_offline.holes import Escapes, find_escapes
+from rayfix_offline.site import read_site
+from rayfix_offline.twin import Twin, prepare_twin
+
+LOST_RAYS_WARNING = 0.01
+"""More lost rays than this share mean that a scene has holes."""
+
+NOTABLE_SHARE = 0.05
+"""A place that at least this share of the escaping rays pass is named."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """What the check of a site found.
+
+    Attributes
+    ----------
+    escapes : tuple of Escapes
+        One for each station that is where a station can be.
+    """
+
+    site_path: Path
+    twin: Twin
+    findings: tuple[Finding, ...]
+    escapes: tuple[Escapes, ...]
+
+    @property
+    def num_errors(self) -> int:
+        """Findings that stop a build."""
+        return sum(finding.severity == "error" for finding in self.findings)
+
+    def document(self) -> dict[str, Any]:
+        """Return the check as JSON-compatible data."""
+        twin = self.twin
+        return {
+            "site": str(self.site_path),
+            "scene": {
+                "size_m": [round(float(length), 6) for length in twin.scene.bounds[1] - twin.scene.bounds[0]],
+                "triangles": len(twin.scene.faces),
+                "planes": len(twin.planes),
+                "surfaces": twin.planes.num_surfaces,
+                "closed": twin.closed,
+                "free_space_m3": round(twin.free_space.volume, 3),
+                "materials": list(twin.scene.materials),
+            },
+            "stations": [
+                {
+                    "id": escapes.station_id,
+                    "lost_ray_share": escapes.share,
+                    "most_to": escapes.side,
+                    "most_at_m": list(escapes.place) if escapes.place else None,
+                }
+                for escapes in self.escapes
+            ],
+            "findings": [
+                {
+                    "severity": finding.severity,
+                    "kind": finding.kind,
+                    "problem": finding.problem,
+                    "remedy": finding.remedy,
+                    "station_id": finding.station_id,
+                }
+                for finding in self.findings
+            ],
+        }
+
+
+def check_site(site_path: Path) -> Check:
+    """Check a site and its scene.
+
+    Raises
+    ------
+    SiteError, SceneError
+        When the site file or the scene cannot be read at all.
+    """
+    site = read_site(site_path)
+    twin = prepare_twin(site, site_path.parent)
+    misplaced = {finding.station_id for finding in twin.findings}
+    escapes = tuple(
+        find_escapes(station, twin, max_reflections=site.propagation.max_reflections)
+        for station in site.stations
+        if station.id not in misplaced
+    )
+    holes = (_hole(found, twin) for found in escapes if found.share > LOST_RAYS_WARNING)
+    return Check(site_path=site_path, twin=twin, findings=(*twin.findings, *holes), escapes=escapes)
+
+
+def _hole(escapes: Escapes, twin: Twin) -> Finding:
+    where = f"{escapes.side_share:.0%} of them towards {escapes.side}"
+    if escapes.place is not None and escapes.place_share > NOTABLE_SHARE:
+        at = ", ".join(f"{v:.1f}" for v in escapes.place)
+        where += f", {escapes.place_share:.0%} near ({at}) m"
+    return Finding(
+        severity="warning",
+        kind="hole",
+        problem=f"{escapes.share:.1%} of the rays of station '{escapes.station_id}' leave the scene, {where}",
+        remedy="close the hole there" if twin.closed else "close it there, unless the site is open to that side",
+        station_id=escapes.station_id,
+    )
