@@ -140,7 +140,7 @@ def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: n
     em = ExpectationMaximisation(num_components=(16,))
     seconds = {}
     print("fits:   window   tubes [cells/s]   em, K = 16 [cells/s]   ratio   components   bytes per cell, tubes")
-    for level in traced.levels:
+    for level in (traced.finest,):
         name = f"{np.rad2deg(level.window):.2f} deg"
         count = min(num_cells, level.grid.num_cells)
         numbers = rng.integers(level.grid.num_cells - count + 1) + np.arange(count)

@@ -165,11 +165,11 @@ def study(name: str, windows: list[float], count: int) -> Iterator[str]:
     """Give a line for each number of facets, window and way to gather."""
     scene = STUDIES[name]
     for facets in scene.facets:
-        twin, site = load(scene.make(facets), windows)
-        own = trace_station(site.stations[0], site, twin)
-        other = site.model_copy(update={"table": site.table.model_copy(update={"seed": 2})})
-        reference = trace_station(site.stations[0], other, load(scene.make(scene.round), windows)[0])
-        for level, drawn in zip(own.levels, reference.levels, strict=True):
+        for window in windows:
+            twin, site = load(scene.make(facets), [window])
+            level = trace_station(site.stations[0], site, twin).finest
+            other = site.model_copy(update={"table": site.table.model_copy(update={"seed": 2})})
+            drawn = trace_station(site.stations[0], other, load(scene.make(scene.round), [window])[0]).finest
             rng = np.random.default_rng(0)
             cells = looking_at(level, name, count, rng)
             points = [sample_points(level.grid.centres[c], drawn, HELD_OUT_POINTS, rng)[0] for c in cells]

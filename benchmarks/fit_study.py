@@ -25,7 +25,7 @@ from rayfix_offline import trace
 from rayfix_offline.em import ExpectationMaximisation, fit_em, sample_points
 from rayfix_offline.plan import BLOCK_CELLS
 from rayfix_offline.site import SiteFile, read_site
-from rayfix_offline.trace import LevelRays, StationTrace, level_grid, trace_station
+from rayfix_offline.trace import LevelRays, level_grid, trace_station
 from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_offline.twin import Twin, prepare_twin
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES, TubeMixture, unpack
@@ -266,9 +266,9 @@ def study(
     scores: list[Score] = []
     for s, station in enumerate(site.stations):
         reference = trace_with(REFERENCE_RATIO, s, site, twin)
-        traces: dict[float, StationTrace] = {}
+        traces: dict[float, list[LevelRays]] = {}
         blocks = []
-        for level, rays in enumerate(reference.levels):
+        for level, rays in enumerate(reference):
             block = [c for c in cells if c.station == s and c.level == level]
             held_out = [
                 sample_points(
@@ -290,16 +290,20 @@ def study(
             for level, reached in blocks:
                 chosen = [(c, points) for c, points in reached if c in mine]
                 if chosen:
-                    scores += score_block(setting, traces[setting.slice_ratio].levels[level], chosen)
+                    scores += score_block(setting, traces[setting.slice_ratio][level], chosen)
         print(f"  {station.id} done", flush=True)
     return scores
 
 
-def trace_with(slice_ratio: float, station: int, site: SiteFile, twin: Twin) -> StationTrace:
-    """Trace a station as a build does, but with other slices."""
+def trace_with(slice_ratio: float, station: int, site: SiteFile, twin: Twin) -> list[LevelRays]:
+    """Trace a station for each window as a build whose finest it is, but with other slices."""
+    sites = [
+        site.model_copy(update={"table": site.table.model_copy(update={"windows_deg": (window,)})})
+        for window in site.table.windows_deg
+    ]
     other: AbstractContextManager[Any] = mock.patch.object(trace, "SLICE_RATIO", slice_ratio)
     with other:
-        return trace_station(site.stations[station], site, twin)
+        return [trace_station(alone.stations[station], alone, twin).finest for alone in sites]
 
 
 def score_block(setting: Setting, level: LevelRays, chosen: Sequence[tuple[Cell, NDArray[np.float64]]]) -> list[Score]:

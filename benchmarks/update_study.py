@@ -95,7 +95,7 @@ def study(
 
 def show(change: str, tolerance: float, summary: BuildSummary) -> None:
     """Print what a build kept."""
-    kept = ", ".join(f"{s.station_id} {s.num_kept_cells / s.num_cells:.0%}" for s in summary.stations)
+    kept = ", ".join(f"{s.station_id} {s.num_kept_cells / s.num_finest_cells:.0%}" for s in summary.stations)
     largest = max(s.largest_change for s in summary.stations)
     print(
         f"{change}, tolerance {tolerance:.0%}: kept {kept} (changed by {largest:.1%}) in {summary.seconds:.0f} s",
@@ -115,14 +115,14 @@ def compare_cells(exact: Table, updated: Table, site_path: Path, count: int, see
         if part.update is None:
             continue
         trace = trace_station(section, site, twin)
-        for n, rays in enumerate(trace.levels):
-            kept = np.flatnonzero(part.update.cell_change[n])
-            for cell in rng.choice(kept, min(len(kept), -(-per_station // len(part.levels))), replace=False):
-                points, _, _ = sample_points(rays.grid.centres[cell], rays, POINTS, rng)
-                ours, theirs = (t.parts[section.id].levels[n] for t in (updated, exact))
-                own, other = (log_densities(lv.cell(int(cell)), points)[0].mean() for lv in (ours, theirs))
-                loss.append(other - own)
-                mass.append(abs(ours.cell_log_mass[cell] - theirs.cell_log_mass[cell]))
+        rays = trace.finest
+        kept = np.flatnonzero(part.update.cell_change[0])
+        for cell in rng.choice(kept, min(len(kept), per_station), replace=False):
+            points, _, _ = sample_points(rays.grid.centres[cell], rays, POINTS, rng)
+            ours, theirs = (t.parts[section.id].levels[0] for t in (updated, exact))
+            own, other = (log_densities(lv.cell(int(cell)), points)[0].mean() for lv in (ours, theirs))
+            loss.append(other - own)
+            mass.append(abs(ours.cell_log_mass[cell] - theirs.cell_log_mass[cell]))
     if loss:
         print(
             f"  held-out log-likelihood lost by {len(loss)} kept cells: mean {np.mean(loss):.5f}, 95 % "

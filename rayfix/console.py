@@ -106,7 +106,8 @@ def print_build_summary(summary: "BuildSummary") -> None:
     console.print(grid)
     for s in summary.stations:
         if s.origin == "updated":
-            console.print(f"{s.station_id}: {_kept(s.num_kept_cells, s.num_cells, s.largest_change)}", highlight=False)
+            kept = _kept(s.num_kept_cells, s.num_finest_cells, s.largest_change)
+            console.print(f"{s.station_id}: {kept}", highlight=False)
     console.print(
         f"{summary.num_bytes / 1e6:.1f} MB in {summary.seconds:.1f} s, at most {summary.peak_bytes / 1e9:.1f} GB of "
         f"memory; table_id {summary.table_id}",
@@ -117,7 +118,7 @@ def print_build_summary(summary: "BuildSummary") -> None:
 
 def _kept(num_kept: int, num_cells: int, largest_change: float) -> str:
     """Say how many cells were not fitted to this scene, and how far they may be from it."""
-    share = f"{num_kept:,} of {num_cells:,} cells kept"
+    share = f"{num_kept:,} of {num_cells:,} finest cells kept"
     return f"{share}, changed by at most {largest_change:.2%}" if largest_change else f"{share}, all of them exact"
 
 

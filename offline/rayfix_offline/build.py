@@ -42,8 +42,10 @@ class StationSummary:
     ----------
     origin : {"built", "resumed", "updated", "kept"}
         Built now; some blocks came from shards; some cells came from the former table; the whole part did.
+    num_finest_cells : int
+        Cells of the finest level, which are fitted to rays; the others are sums of them.
     num_kept_cells : int
-        Cells that came from the former table.
+        Finest cells that came from the former table.
     largest_change : float
         By how much of its mass the measure of a kept cell has changed at most; 0 in an exact table.
     """
@@ -52,6 +54,7 @@ class StationSummary:
     origin: str
     num_cells: int
     num_filled_cells: int
+    num_finest_cells: int
     num_kept_cells: int
     largest_change: float
     num_components: int
@@ -211,6 +214,7 @@ def _summary(station_id: str, built: BuiltStation) -> StationSummary:
         origin=built.origin,
         num_cells=sum(level.grid.num_cells for level in content.levels),
         num_filled_cells=sum(int(np.isfinite(level.cell_log_mass).sum()) for level in content.levels),
+        num_finest_cells=content.levels[0].num_cells,
         num_kept_cells=built.num_kept_cells,
         largest_change=content.update.largest_change if content.update else 0.0,
         num_components=sum(len(level.mixture) for level in content.levels),

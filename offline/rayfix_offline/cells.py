@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_offline.coarse import CoarseFit, sum_cells
 from rayfix_offline.em import ExpectationMaximisation, fit_em
 from rayfix_offline.site import SiteFile
 from rayfix_offline.trace import LevelRays
@@ -93,6 +94,20 @@ def fit_cells(cells: NDArray[np.int64], level: LevelRays, site: SiteFile) -> Fit
         counts, log_mass, mixture = fit_tubes(centres, level, TubeFit())
     change = np.zeros(len(cells), np.float32)
     return FittedCells(cells=cells, counts=counts, log_mass=log_mass, change=change, mixture=mixture)
+
+
+def widen_cells(
+    cells: NDArray[np.int64], window: float, grid: AngularGrid, finer: Level, finer_change: NDArray[np.float32]
+) -> FittedCells:
+    """Make cells of a wide window [rad] from those of the next finer level; see :func:`sum_cells`."""
+    summed = sum_cells(grid.centres[cells], window, finer, finer_change, CoarseFit())
+    return FittedCells(
+        cells=cells,
+        counts=summed.counts,
+        log_mass=summed.log_mass,
+        change=summed.change.astype(np.float32),
+        mixture=summed.mixture,
+    )
 
 
 def assemble_level(window: float, grid: AngularGrid, parts: Sequence[FittedCells]) -> Level:

@@ -6,6 +6,7 @@ is lost, Dask gives its blocks to the others.
 """
 
 import threading
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -14,14 +15,15 @@ import numpy as np
 from distributed import Client, as_completed
 from numpy.typing import NDArray
 
-from rayfix_offline.cells import FittedCells, fit_cells
+from rayfix_offline.cells import FittedCells, fit_cells, widen_cells
 from rayfix_offline.plan import BUILD_VERSION, Block, StationPlan
 from rayfix_offline.scene import Scene
 from rayfix_offline.shards import content_key
 from rayfix_offline.site import SiteFile, parse_site
-from rayfix_offline.trace import StationTrace, trace_station
+from rayfix_offline.trace import StationTrace, level_grid, trace_station
 from rayfix_offline.twin import prepare_scene
 from rayfix_tables.errors import BuildError
+from rayfix_tables.level import Level
 
 CONNECT_SECONDS = 15
 """How long a scheduler may take to answer."""
@@ -93,14 +95,37 @@ class Cluster:
             When a block fails, or is lost with its worker too often.
         """
         by_name = {block.shard: block for block in blocks}
-        tasks = {name: (_fit_remotely, (block.level, block.cells)) for name, block in by_name.items()}
+        tasks = {name: (_fit_remotely, (block.cells,)) for name, block in by_name.items()}
+        for name, arrays in self._run(plan, tasks):
+            yield by_name[name], FittedCells.from_arrays(arrays)
+
+    def widen_blocks(
+        self, plan: StationPlan, blocks: list[Block], finer: Level, finer_change: NDArray[np.float32]
+    ) -> Iterator[tuple[Block, FittedCells]]:
+        """Make blocks of a wide level on all workers; they come back as they are ready.
+
+        Raises
+        ------
+        BuildError
+            When a block fails, or is lost with its worker too often.
+        """
+        if not blocks:
+            return
+        by_name = {block.shard: block for block in blocks}
+        with warnings.catch_warnings():
+            # The finer level goes to the scheduler once and from there to each worker, which is what is wanted.
+            warnings.simplefilter("ignore", UserWarning)
+            source = self._client.submit(
+                _hand_on, finer, finer_change, key=f"rayfix-{plan.part_id}-under-{blocks[0].level}"
+            )
+        tasks = {name: (_widen_remotely, (source, block.level, block.cells)) for name, block in by_name.items()}
         for name, arrays in self._run(plan, tasks):
             yield by_name[name], FittedCells.from_arrays(arrays)
 
     def _run(self, plan: StationPlan, tasks: Mapping[str, _Task]) -> Iterator[tuple[str, dict[str, Any]]]:
         """Run tasks on the workers."""
         # A task that hands the inputs on, and not data scattered to workers: Dask can repeat it when they are lost.
-        inputs = self._client.submit(_inputs, self._site, self._scene, key=f"rayfix-inputs-{self._inputs_id}")
+        inputs = self._client.submit(_hand_on, self._site, self._scene, key=f"rayfix-inputs-{self._inputs_id}")
         futures = {
             self._client.submit(
                 run,
@@ -128,20 +153,33 @@ class Cluster:
 
 def _fingerprint(arguments: tuple[Any, ...]) -> str:
     """Tell tasks of one block apart that fit different cells of it."""
-    return content_key([a.tolist() if isinstance(a, np.ndarray) else a for a in arguments])[:16]
+    return content_key([a.tolist() for a in arguments if isinstance(a, np.ndarray)])[:16]
 
 
-def _inputs(site: dict[str, Any], scene: Scene) -> tuple[dict[str, Any], Scene]:
-    """Hand the inputs of all tasks on to the workers."""
-    return site, scene
+def _hand_on(*inputs: Any) -> tuple[Any, ...]:
+    """Hand inputs of many tasks on to the workers."""
+    return inputs
 
 
 def _fit_remotely(
-    part: tuple[str, int, str], inputs: tuple[dict[str, Any], Scene], level: int, cells: NDArray[np.int64]
+    part: tuple[str, int, str], inputs: tuple[dict[str, Any], Scene], cells: NDArray[np.int64]
 ) -> dict[str, Any]:
     """Fit a block on a worker."""
     site = parse_site(inputs[0])
-    return fit_cells(cells, _trace(part, site, inputs[1]).levels[level], site).to_arrays()
+    return fit_cells(cells, _trace(part, site, inputs[1]).finest, site).to_arrays()
+
+
+def _widen_remotely(
+    part: tuple[str, int, str],
+    inputs: tuple[dict[str, Any], Scene],
+    source: tuple[Level, NDArray[np.float32]],
+    level: int,
+    cells: NDArray[np.int64],
+) -> dict[str, Any]:
+    """Make a block of a wide level on a worker."""
+    _check_version(part[1])
+    window = float(np.deg2rad(parse_site(inputs[0]).table.windows_deg[level]))
+    return widen_cells(cells, window, level_grid(window), *source).to_arrays()
 
 
 def _launch_remotely(part: tuple[str, int, str], inputs: tuple[dict[str, Any], Scene]) -> dict[str, Any]:
@@ -152,11 +190,7 @@ def _launch_remotely(part: tuple[str, int, str], inputs: tuple[dict[str, Any], S
 def _trace(part: tuple[str, int, str], site: SiteFile, scene: Scene) -> StationTrace:
     """Rays of a station, traced once on each worker."""
     part_id, version, station_id = part
-    if version != BUILD_VERSION:
-        raise BuildError(
-            f"a worker builds tables of version {BUILD_VERSION}, this build needs {version}; install the same rayfix "
-            "on all workers"
-        )
+    _check_version(version)
     with _lock:
         if part_id not in _traces:
             (section,) = [s for s in site.stations if s.id == station_id]
@@ -164,3 +198,11 @@ def _trace(part: tuple[str, int, str], site: SiteFile, scene: Scene) -> StationT
             while len(_traces) > TRACES_KEPT:
                 _traces.popitem(last=False)
         return _traces[part_id]
+
+
+def _check_version(version: int) -> None:
+    if version != BUILD_VERSION:
+        raise BuildError(
+            f"a worker builds tables of version {BUILD_VERSION}, this build needs {version}; install the same rayfix "
+            "on all workers"
+        )

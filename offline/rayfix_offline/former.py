@@ -25,24 +25,24 @@ from rayfix_tables.table import StationPart, Table
 
 @dataclass(frozen=True, kw_only=True)
 class KeptCells:
-    """Cells of a station that need not be fitted again.
+    """Cells of a station's finest level that need not be fitted again.
 
     Attributes
     ----------
     part : StationPart
         That they come from.
-    change : tuple of ndarray of shape (n_cells,)
-        By level: bound on the change of the cell's measure since it was fitted; inf where it must be fitted again.
+    change : ndarray of shape (n_cells,)
+        Bound on the change of each cell's measure since it was fitted; inf where it must be fitted again.
     """
 
     part: StationPart
-    change: tuple[NDArray[np.float64], ...]
+    change: NDArray[np.float64]
 
     def split(self, block: Block) -> tuple[FittedCells, Block]:
         """Divide a block into the cells that are kept and those that must be fitted."""
-        change = self.change[block.level][block.cells]
+        change = self.change[block.cells]
         kept = np.isfinite(change)
-        cells = FittedCells.of_level(self.part.levels[block.level], block.cells[kept], change[kept])
+        cells = FittedCells.of_level(self.part.levels[0], block.cells[kept], change[kept])
         return cells, block.only(block.cells[~kept])
 
 
@@ -74,18 +74,14 @@ class FormerStation:
             Largest change; with 0, only cells that are the same to the last bit.
         """
         former = trace_station(self.plan.section, self.site, self.twin)
-        kept = []
-        for n, (old, new) in enumerate(zip(former.levels, trace.levels, strict=True)):
-            change = np.full(new.grid.num_cells, np.inf)
-            compared = cell_changes(old, new)
-            for block in self.plan.blocks:
-                if block.level == n:
-                    change[block.cells] = compared[block.cells]
-            if self.part.update is not None:
-                # The cell was kept before: the changes add up, each as a share of the mass after it.
-                change += self.part.update.cell_change[n] * (1.0 + change)
-            kept.append(np.where(change <= tolerance, change, np.inf))
-        return KeptCells(part=self.part, change=tuple(kept))
+        compared = cell_changes(former.finest, trace.finest)
+        change = np.full(len(compared), np.inf)
+        for block in self.plan.finest_blocks:
+            change[block.cells] = compared[block.cells]
+        if self.part.update is not None:
+            # The cell was kept before: the changes add up, each as a share of the mass after it.
+            change += self.part.update.cell_change[0] * (1.0 + change)
+        return KeptCells(part=self.part, change=np.where(change <= tolerance, change, np.inf))
 
 
 @dataclass(frozen=True, kw_only=True)

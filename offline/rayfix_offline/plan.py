@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline import moments, surfaces, trace
+from rayfix_offline.coarse import CoarseFit
 from rayfix_offline.em import ExpectationMaximisation
 from rayfix_offline.shards import content_key
 from rayfix_offline.site import SiteFile, StationSection
@@ -23,6 +24,9 @@ BUILD_VERSION = 3
 
 BLOCK_CELLS = 256
 """Cells that one task fits and one shard holds."""
+
+WIDE_BLOCK_CELLS = 64
+"""The same for the levels whose cells are sums of others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +77,18 @@ class StationPlan:
     blocks: tuple[Block, ...]
 
     @property
+    def finest_blocks(self) -> tuple[Block, ...]:
+        """Blocks that are fitted to rays."""
+        return tuple(block for block in self.blocks if block.level == 0)
+
+    @property
+    def num_finest_cells(self) -> int:
+        """Number of cells that are fitted to rays."""
+        return sum(len(block.cells) for block in self.finest_blocks)
+
+    @property
     def num_cells(self) -> int:
-        """Number of cells to fit."""
+        """Number of cells to make."""
         return sum(len(block.cells) for block in self.blocks)
 
 
@@ -114,7 +128,7 @@ def _method_settings(site: SiteFile, *, curved: bool) -> dict[str, float | dict[
         for name, value in vars(module).items()
         if name.isupper() and isinstance(value, int | float)
     }
-    return {**constants, "fit": dataclasses.asdict(fit)}
+    return {**constants, "fit": dataclasses.asdict(fit), "coarse": dataclasses.asdict(CoarseFit())}
 
 
 def _blocks(station: Station, site: SiteFile) -> tuple[Block, ...]:
@@ -125,8 +139,8 @@ def _blocks(station: Station, site: SiteFile) -> tuple[Block, ...]:
         centres = level_grid(float(window)).centres
         angle = np.arccos(np.clip(direction(centres[:, 0], centres[:, 1]) @ axis, -1.0, 1.0))
         cells = np.flatnonzero(angle <= 0.5 * station.field_of_view + window)
+        size = WIDE_BLOCK_CELLS if level else BLOCK_CELLS
         blocks.extend(
-            Block(level=level, number=n, cells=cells[i : i + BLOCK_CELLS])
-            for n, i in enumerate(range(0, len(cells), BLOCK_CELLS))
+            Block(level=level, number=n, cells=cells[i : i + size]) for n, i in enumerate(range(0, len(cells), size))
         )
     return tuple(blocks)

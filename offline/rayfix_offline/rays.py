@@ -46,36 +46,3 @@ def sample_rays(spacing: float, rng: np.random.Generator) -> RaySet:
     high, low = np.cos(ring * np.pi / grid.num_rings), np.cos((ring + 1) * np.pi / grid.num_rings)
     zenith = np.arccos(high + (low - high) * rng.random(grid.num_cells))
     return RaySet(grid=grid, azimuth=azimuth, zenith=zenith, solid_angle=grid.solid_angles[ring])
-
-
-def thin(rays: RaySet, spacing: float) -> tuple[RaySet, NDArray[np.int64]]:
-    """Choose one ray in each cell of a coarser grid.
-
-    Parameters
-    ----------
-    spacing : float, rad
-        At least twice that of ``rays``.
-
-    Returns
-    -------
-    rays : RaySet
-    index : ndarray of int64
-        Places of the chosen rays in the finer set.
-    """
-    grid = AngularGrid.from_spacing(spacing)
-    if rays.grid.num_rings < 2 * grid.num_rings - 1:
-        raise ValueError(f"rays {spacing} rad apart cannot be chosen from a set that is hardly finer")
-    cell = grid.nearest(rays.azimuth, rays.zenith)
-    # The rays are stratified already; the middle one of a cell is as good a draw as any.
-    order = np.argsort(cell, kind="stable")
-    count = np.bincount(cell, minlength=grid.num_cells)
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    index = order[np.minimum(first + count // 2, len(order) - 1)]
-    # At twice the spacing a few cells hold no whole finer cell, and may be empty: the ray at their centre is as near.
-    empty = np.flatnonzero(count == 0)
-    index[empty] = rays.grid.nearest(grid.centres[empty, 0], grid.centres[empty, 1])
-    ring = np.repeat(np.arange(grid.num_rings), grid.ring_cells)
-    chosen = RaySet(
-        grid=grid, azimuth=rays.azimuth[index], zenith=rays.zenith[index], solid_angle=grid.solid_angles[ring]
-    )
-    return chosen, index

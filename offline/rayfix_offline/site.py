@@ -10,6 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from rayfix_tables.errors import SiteError
 from rayfix_tables.site import SiteInfo, Station, StationBias
 
+LEAST_WINDOW_RATIO = 1.5
+"""A window is at least this many times the one before it: its cells are sums, which must be flat, of those."""
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Triple = tuple[Finite, Finite, Finite]
@@ -52,8 +55,11 @@ class TableSection(_Section):
     def _windows_ascend(self) -> "TableSection":
         if not self.windows_deg:
             raise ValueError("windows_deg must name at least one window, e.g. [1.25, 5.0, 15.0]")
-        if any(b <= a for a, b in zip(self.windows_deg, self.windows_deg[1:], strict=False)):
-            raise ValueError("windows_deg must grow from each window to the next, e.g. [1.25, 5.0, 15.0]")
+        if any(b < LEAST_WINDOW_RATIO * a for a, b in zip(self.windows_deg, self.windows_deg[1:], strict=False)):
+            raise ValueError(
+                f"windows_deg must grow to at least {LEAST_WINDOW_RATIO:g} times from each window to the next, "
+                "e.g. [1.25, 5.0, 15.0]"
+            )
         return self
 
 

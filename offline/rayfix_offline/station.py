@@ -1,20 +1,22 @@
 """Build one station's part of a table, from shards, from a former table, and by fitting what is left."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from joblib import Parallel, delayed
+from numpy.typing import NDArray
 
-from rayfix_offline.cells import FittedCells, assemble_changes, assemble_level, fit_cells
+from rayfix_offline.cells import FittedCells, assemble_changes, assemble_level, fit_cells, widen_cells
 from rayfix_offline.former import FormerStation, FormerTable, KeptCells
 from rayfix_offline.plan import Block, StationPlan, updated_part_id
 from rayfix_offline.shards import ShardStore
 from rayfix_offline.site import SiteFile
 from rayfix_offline.trace import StationTrace, level_grid, trace_station
 from rayfix_offline.twin import Twin
+from rayfix_tables.level import Level
 from rayfix_tables.table import StationPart
 from rayfix_tables.update import Update
 from rayfix_tables.write import StationContent
@@ -58,7 +60,7 @@ class BuiltStation:
     origin : {"built", "resumed", "updated", "kept"}
         Fitted now; some blocks from shards; some cells from a former table; all of it from there.
     num_kept_cells : int
-        Cells taken from the former table.
+        Cells of the finest level taken from the former table.
     """
 
     content: StationContent
@@ -71,7 +73,7 @@ def keep_station(plan: StationPlan, job: Job) -> BuiltStation | None:
     part = job.former.whole_part(plan, job.tolerance) if job.former else None
     if part is None:
         return None
-    return BuiltStation(content=_content_of(part), origin="kept", num_kept_cells=plan.num_cells)
+    return BuiltStation(content=_content_of(part), origin="kept", num_kept_cells=plan.num_finest_cells)
 
 
 def build_station(plan: StationPlan, job: Job, remote: "Cluster | None", report: StationProgress) -> BuiltStation:
@@ -88,9 +90,9 @@ def build_station(plan: StationPlan, job: Job, remote: "Cluster | None", report:
         name = updated_part_id(plan.part_id, former.part.part_id, job.tolerance)
     launch, parts = _load(name, plan, job.store)
     resumed, num_kept = bool(parts), 0
-    missing = [block for block in plan.blocks if block.key not in parts]
+    done = sum(len(fitted.cells) for fitted in parts.values())
+    missing = [block for block in plan.finest_blocks if block.key not in parts]
     if missing or launch is None:
-        done = plan.num_cells - sum(len(block.cells) for block in missing)
         report(f"{plan.station.id}: tracing rays", done)
         kept: dict[tuple[int, int], FittedCells] = {}
         if remote is not None and former is None:
@@ -110,12 +112,28 @@ def build_station(plan: StationPlan, job: Job, remote: "Cluster | None", report:
             parts[block.key] = fitted.joined(kept[block.key]) if block.key in kept else fitted
             job.store.save(f"{name}-{block.shard}", parts[block.key].to_arrays())
             done += len(block.cells)
-            report(f"{plan.station.id}: {job.site.table.windows_deg[block.level]:g} deg cells", done)
+            report(_stage(plan, job, block), done)
+    levels = [_assemble_level(0, job, parts)]
+    for n in range(1, len(job.site.table.windows_deg)):
+        missing = [block for block in plan.blocks if block.level == n and block.key not in parts]
+        widening = (
+            remote.widen_blocks(plan, missing, *levels[-1]) if remote else _widen_blocks(missing, *levels[-1], job)
+        )
+        for block, widened in widening:
+            parts[block.key] = widened
+            job.store.save(f"{name}-{block.shard}", widened.to_arrays())
+            done += len(block.cells)
+            report(_stage(plan, job, block), done)
+        levels.append(_assemble_level(n, job, parts))
     return BuiltStation(
-        content=_assemble(plan, job, former, parts, launch),
+        content=_assemble(plan, job, former, levels, launch),
         origin="updated" if num_kept else "resumed" if resumed else "built",
         num_kept_cells=num_kept,
     )
+
+
+def _stage(plan: StationPlan, job: Job, block: Block) -> str:
+    return f"{plan.station.id}: {job.site.table.windows_deg[block.level]:g} deg cells"
 
 
 def _load(
@@ -144,11 +162,28 @@ def _split(blocks: list[Block], kept: KeptCells) -> tuple[dict[tuple[int, int], 
 
 def _fit_blocks(blocks: list[Block], trace: StationTrace, job: Job) -> Iterator[tuple[Block, FittedCells]]:
     """Fit blocks in parallel; they come back in their order."""
-    tasks = (delayed(fit_cells)(block.cells, trace.levels[block.level], job.site) for block in blocks)
+    tasks = (delayed(fit_cells)(block.cells, trace.finest, job.site) for block in blocks)
     # The compiled kernels release the interpreter's lock, so threads share the rays without a copy; scikit-learn
     # holds it, so its fits need processes.
-    prefer = "processes" if job.site.table.fit == "em" else "threads"
-    results = Parallel(n_jobs=job.jobs, prefer=prefer, return_as="generator")(tasks)
+    return _in_parallel(blocks, tasks, job.jobs, "processes" if job.site.table.fit == "em" else "threads")
+
+
+def _widen_blocks(
+    blocks: list[Block], finer: Level, finer_change: NDArray[np.float32], job: Job
+) -> Iterator[tuple[Block, FittedCells]]:
+    """Make blocks of a wide level in parallel; they come back in their order."""
+    tasks = (
+        delayed(widen_cells)(block.cells, window, level_grid(window), finer, finer_change)
+        for block in blocks
+        for window in [_window(block.level, job)]
+    )
+    return _in_parallel(blocks, tasks, job.jobs, "threads")
+
+
+def _in_parallel(
+    blocks: list[Block], tasks: Iterable[Any], jobs: int, prefer: str
+) -> Iterator[tuple[Block, FittedCells]]:
+    results = Parallel(n_jobs=jobs, prefer=prefer, return_as="generator")(tasks)
     try:
         yield from zip(blocks, results, strict=True)
     finally:
@@ -158,19 +193,30 @@ def _fit_blocks(blocks: list[Block], trace: StationTrace, job: Job) -> Iterator[
             results.close()
 
 
+def _window(level: int, job: Job) -> float:
+    return float(np.deg2rad(job.site.table.windows_deg[level]))
+
+
+def _assemble_level(
+    level: int, job: Job, parts: dict[tuple[int, int], FittedCells]
+) -> tuple[Level, NDArray[np.float32]]:
+    """Put the blocks of a level together, and the changes of its cells."""
+    window = _window(level, job)
+    grid = level_grid(window)
+    blocks = [parts[key] for key in sorted(parts) if key[0] == level]
+    return assemble_level(window, grid, blocks), assemble_changes(grid, blocks)
+
+
 def _assemble(
     plan: StationPlan,
     job: Job,
     former: FormerStation | None,
-    parts: dict[tuple[int, int], FittedCells],
+    levels: list[tuple[Level, NDArray[np.float32]]],
     launch: dict[str, Any],
 ) -> StationContent:
-    """Put the blocks of a station together."""
-    windows = np.deg2rad(job.site.table.windows_deg)
-    grids = [level_grid(float(window)) for window in windows]
-    by_level = [[parts[key] for key in sorted(parts) if key[0] == n] for n in range(len(windows))]
+    """Put the levels of a station together."""
     part_id, update = plan.part_id, None
-    change = tuple(assemble_changes(grid, blocks) for grid, blocks in zip(grids, by_level, strict=True))
+    change = tuple(change for _, change in levels)
     if former is not None and any(level.any() for level in change):
         part_id = updated_part_id(plan.part_id, former.part.part_id, job.tolerance)
         update = Update(
@@ -182,10 +228,7 @@ def _assemble(
     return StationContent(
         part_id=part_id,
         update=update,
-        levels=tuple(
-            assemble_level(float(window), grid, blocks)
-            for window, grid, blocks in zip(windows, grids, by_level, strict=True)
-        ),
+        levels=tuple(level for level, _ in levels),
         lost_ray_share=float(launch["lost_ray_share"]),
         coverage=tuple(float(share) for share in launch["coverage"]),
     )

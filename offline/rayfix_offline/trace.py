@@ -1,4 +1,4 @@
-"""All rays of one station, traced once and cut into the pieces that its cells share."""
+"""All rays of one station, traced once and cut into the pieces that the cells of its finest level share."""
 
 import hashlib
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from rayfix_offline.launch import Sequences, launch
 from rayfix_offline.materials import Reflectivity, constant_reflectivity, itu_reflectivity
 from rayfix_offline.pathprior import fill_path_prior
 from rayfix_offline.pieces import Pieces, cut_pieces
-from rayfix_offline.rays import RaySet, sample_rays, thin
+from rayfix_offline.rays import RaySet, sample_rays
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.surfaces import surface_sequences
 from rayfix_offline.twin import Twin
@@ -18,9 +18,6 @@ from rayfix_tables.grid import AngularGrid
 
 RAYS_PER_WINDOW = 3.0
 """Rays lie this many times as close as the finest window's standard deviation."""
-
-RAYS_PER_WIDE_WINDOW = 6.0
-"""The same for the wider windows, which have few cells."""
 
 CELLS_PER_WINDOW = 0.8
 """Cells are this many times as close as their window's standard deviation."""
@@ -34,7 +31,7 @@ PRIOR_REFINEMENT = 2
 
 @dataclass(frozen=True, kw_only=True)
 class LevelRays:
-    """What the cells of one level are fitted to.
+    """What the cells of a level are fitted to.
 
     Attributes
     ----------
@@ -56,17 +53,19 @@ class LevelRays:
 
 @dataclass(frozen=True, kw_only=True)
 class StationTrace:
-    """A station's rays by level, finest first, and what the launch found out.
+    """A station's rays and what the launch found out.
 
     Attributes
     ----------
+    finest : LevelRays
+        For the finest level; the cells of the others are sums of its cells.
     lost_ray_share : float
         Share of the rays that left the scene instead of hitting a surface.
     coverage : tuple of float
         Share of the free space that is reached with at most 0, 1, 2, ... reflections.
     """
 
-    levels: tuple[LevelRays, ...]
+    finest: LevelRays
     lost_ray_share: float
     coverage: tuple[float, ...]
 
@@ -103,8 +102,8 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin, *, jobs: 
     jobs : int
         Threads; -1 for one per core. The trace is the same with any number.
     """
-    windows = np.deg2rad(site.table.windows_deg)
-    spacing = float(windows[0]) / RAYS_PER_WINDOW
+    window = float(np.deg2rad(site.table.windows_deg[0]))
+    spacing = window / RAYS_PER_WINDOW
     name = int.from_bytes(hashlib.sha256(station.id.encode()).digest()[:8], "big")
     rays = sample_rays(spacing, np.random.default_rng([site.table.seed, name]))
     segments = launch(
@@ -128,23 +127,13 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin, *, jobs: 
         slice_ratio=SLICE_RATIO,
         jobs=jobs,
     )
-    over_surfaces = surface_sequences(segments.sequences, twin.planes)
-    levels = []
-    for window in (float(w) for w in windows):
-        level_rays, level_pieces, level_spacing = rays, pieces, spacing
-        if window / RAYS_PER_WIDE_WINDOW >= 2.0 * spacing:
-            level_spacing = window / RAYS_PER_WIDE_WINDOW
-            level_rays, index = thin(rays, level_spacing)
-            level_pieces = pieces.of_rays(index)
-        levels.append(
-            LevelRays(
-                window=window,
-                grid=level_grid(window),
-                rays=level_rays,
-                ray_spacing=level_spacing,
-                pieces=level_pieces,
-                sequences=segments.sequences,
-                surface_sequences=over_surfaces,
-            )
-        )
-    return StationTrace(levels=tuple(levels), lost_ray_share=segments.lost_ray_share, coverage=prior.coverage)
+    finest = LevelRays(
+        window=window,
+        grid=level_grid(window),
+        rays=rays,
+        ray_spacing=spacing,
+        pieces=pieces,
+        sequences=segments.sequences,
+        surface_sequences=surface_sequences(segments.sequences, twin.planes),
+    )
+    return StationTrace(finest=finest, lost_ray_share=segments.lost_ray_share, coverage=prior.coverage)

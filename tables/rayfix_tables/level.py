@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 
+WINDOW_RATIO = 1.25
+"""A window's standard deviation is at least this times that of a measurement it serves."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Level:

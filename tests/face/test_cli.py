@@ -116,7 +116,7 @@ def test_an_updated_table_says_so(capsys: pytest.CaptureFixture[str], tmp_path: 
     site.write_text(text.replace("reflection_loss_db = 6.0", "reflection_loss_db = 6.01"), encoding="utf-8")
     status, out, err = run(capsys, "build", site, "-o", table, "--tolerance", "0.05", "--no-progress")
     assert (status, err) == (0, "")
-    assert re.search(r"bs1: \d+ of \d+ cells kept, changed by at most \d\.\d\d%", out)
+    assert re.search(r"bs1: \d+ of \d+ finest cells kept, changed by at most \d\.\d\d%", out)
     out = run(capsys, "info", table)[1]
     assert "(tolerance 5.00%); build without --tolerance to make it exact" in out
     facts = json.loads(run(capsys, "info", table, "--json")[1])

@@ -39,7 +39,7 @@ def pillar_room(folder: Path, facets: int) -> tuple[Twin, LevelRays]:
         }
     )
     twin = prepare_twin(site, folder)
-    return twin, trace_station(site.stations[0], site, twin).levels[0]
+    return twin, trace_station(site.stations[0], site, twin).finest
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ def level(tmp_path_factory: pytest.TempPathFactory, site_document: Callable[...,
         scene.add_geometry(trimesh.creation.box(bounds=bounds), geom_name=name, node_name=name)
     (folder / "room.glb").write_bytes(scene.export(file_type="glb"))
     site = parse_site(site_document())
-    return trace_station(site.stations[0], site, prepare_twin(site, folder)).levels[0]
+    return trace_station(site.stations[0], site, prepare_twin(site, folder)).finest
 
 
 def moments_of_pieces(level: LevelRays, cell: int) -> tuple[NDArray[np.float64], float, float]:

@@ -1,4 +1,4 @@
-"""Sampled directions stand for the whole sphere, and thinned ones still do."""
+"""Sampled directions stand for the whole sphere."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_offline.rays import RaySet, sample_rays, thin
+from rayfix_offline.rays import RaySet, sample_rays
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -59,47 +59,3 @@ def test_the_seed_decides() -> None:
     first, again, other = (sample_rays(0.1, np.random.default_rng(seed)) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first.directions, again.directions)
     assert np.abs(first.directions - other.directions).max() > 0.01
-
-
-@settings(max_examples=25, deadline=None)
-@given(spacing=st.floats(0.03, 0.2), ratio=st.floats(2.1, 5.0), seed=seeds)
-def test_thinned_rays_lie_one_in_each_coarse_cell(spacing: float, ratio: float, seed: int) -> None:
-    rays = sample_rays(spacing, np.random.default_rng(seed))
-    thinned, index = thin(rays, ratio * spacing)
-    np.testing.assert_array_equal(cells_of(thinned), np.arange(len(thinned)))
-    np.testing.assert_array_equal(thinned.directions, rays.directions[index])
-    assert len(np.unique(index)) == len(thinned) < len(rays) / 2
-    assert thinned.solid_angle.sum() == pytest.approx(4.0 * np.pi, rel=1e-12)
-
-
-@settings(max_examples=25, deadline=None)
-@given(spacing=st.floats(0.03, 0.2), seed=seeds)
-def test_rays_can_be_thinned_to_twice_their_spacing(spacing: float, seed: int) -> None:
-    """A cell that no ray happens to lie in takes one from a neighbour."""
-    rays = sample_rays(spacing, np.random.default_rng(seed))
-    thinned, index = thin(rays, 2.0 * spacing)
-    np.testing.assert_array_equal(thinned.directions, rays.directions[index])
-    assert np.count_nonzero(cells_of(thinned) != np.arange(len(thinned))) <= 2
-    centres = np.stack(
-        [
-            np.sin(thinned.grid.centres[:, 1]) * np.cos(thinned.grid.centres[:, 0]),
-            np.sin(thinned.grid.centres[:, 1]) * np.sin(thinned.grid.centres[:, 0]),
-            np.cos(thinned.grid.centres[:, 1]),
-        ],
-        axis=-1,
-    )
-    assert np.linalg.norm(thinned.directions - centres, axis=1).max() < 2.0 * spacing
-
-
-def test_windows_at_a_ratio_of_four_can_leave_a_cell_empty() -> None:
-    """Rays of windows 6.53 and 26.12 deg with this seed; cell 2224 of 2,734 holds none of the finer rays."""
-    rays = sample_rays(np.deg2rad(6.53) / 3.0, np.random.default_rng(2876))
-    thinned, _ = thin(rays, np.deg2rad(26.12) / 6.0)
-    assert 2224 not in thinned.grid.nearest(rays.azimuth, rays.zenith)
-    assert np.flatnonzero(cells_of(thinned) != np.arange(len(thinned))).tolist() == [2224]
-
-
-def test_rays_cannot_be_made_denser() -> None:
-    rays = sample_rays(0.1, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="hardly finer"):
-        thin(rays, 0.11)

@@ -176,10 +176,13 @@ def test_nothing_of_what_there_must_be_one(site_document: Document) -> None:
     assert refused(site_document(stations=[])) == "stations must name at least one; add a [[stations]] section"
 
 
-@pytest.mark.parametrize("windows", [[5.0, 5.0], [5.0, 1.0], [1.0, 5.0, 4.0]])
-def test_windows_that_do_not_ascend(site_document: Document, windows: list[float]) -> None:
+@pytest.mark.parametrize("windows", [[5.0, 5.0], [5.0, 7.4], [5.0, 1.0], [1.0, 5.0, 4.0]])
+def test_windows_that_do_not_grow(site_document: Document, windows: list[float]) -> None:
     message = refused(site_document(table={"windows_deg": windows}))
-    assert message == "table: windows_deg must grow from each window to the next, e.g. [1.25, 5.0, 15.0]"
+    assert (
+        message
+        == "table: windows_deg must grow to at least 1.5 times from each window to the next, e.g. [1.25, 5.0, 15.0]"
+    )
 
 
 def test_stations_of_the_same_name(site_document: Document) -> None:

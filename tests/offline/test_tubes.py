@@ -28,7 +28,7 @@ def level_of(folder: Path, scene: trimesh.Scene, document: dict[str, Any]) -> Le
     """Trace the first station of a site and give its first level."""
     (folder / "room.glb").write_bytes(scene.export(file_type="glb"))
     site: SiteFile = parse_site(document)
-    return trace_station(site.stations[0], site, prepare_twin(site, folder)).levels[0]
+    return trace_station(site.stations[0], site, prepare_twin(site, folder)).finest
 
 
 @pytest.fixture(scope="module")

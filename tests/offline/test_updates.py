@@ -67,7 +67,7 @@ def former(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def station(summary: BuildSummary, name: str) -> tuple[str, float]:
     """Where a station's part came from, and the share of its cells that was kept."""
     (found,) = [s for s in summary.stations if s.station_id == name]
-    return found.origin, found.num_kept_cells / found.num_cells
+    return found.origin, found.num_kept_cells / found.num_finest_cells
 
 
 def assert_within_its_changes(table: Table, whole: Table) -> dict[str, float]:

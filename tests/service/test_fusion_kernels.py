@@ -13,7 +13,7 @@ from scipy.stats import norm
 from rayfix_service.fusion import kernels, mode_kernels, reference
 from rayfix_service.fusion.factors import ALL_GOOD, make_factor
 from rayfix_service.fusion.likelihood import Term, gaussian_terms, log_normal_terms, spreads
-from rayfix_service.fusion.lookup import WINDOW_RATIO, Direction
+from rayfix_service.fusion.lookup import Direction
 from rayfix_service.fusion.modes import unit_points
 from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.prior import Prior
@@ -21,7 +21,7 @@ from rayfix_service.fusion.report import GAUSSIAN, ErrorModel
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
-from rayfix_tables.level import Level
+from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture, pack, unpack
 from rayfix_tables.site import Station
 from rayfix_tables.table import StationPart

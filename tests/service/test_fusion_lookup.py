@@ -6,10 +6,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.lookup import NO_DIRECTION, WINDOW_RATIO, Direction, Lookup, look_up
+from rayfix_service.fusion.lookup import NO_DIRECTION, Direction, Lookup, look_up
 from rayfix_tables.angles import wrap
 from rayfix_tables.grid import AngularGrid
-from rayfix_tables.level import Level
+from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture
 
 Array = NDArray[np.float64]

@@ -20,10 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.angles import wrap
-from rayfix_tables.level import Level
-
-WINDOW_RATIO = 1.25
-"""A window's standard deviation is at least this times that of a measurement it serves."""
+from rayfix_tables.level import WINDOW_RATIO, Level
 
 _SUM_REACH = 3.0
 """Cells within this many standard deviations of their weights are summed."""
