@@ -136,6 +136,13 @@ def _add_output_arguments(command: argparse.ArgumentParser) -> None:
         metavar="NAME=STATION",
         help="the station that the report calls NAME; may be given several times",
     )
+    command.add_argument(
+        "--height",
+        type=float,
+        nargs=2,
+        metavar=("Z", "STDEV"),
+        help="known height of the target in the scene and its standard deviation, m",
+    )
 
 
 def _jobs(text: str) -> int:
@@ -232,13 +239,14 @@ def _locate(options: argparse.Namespace) -> int:
     with needs_extra("service"):
         from rayfix.console import print_fix
         from rayfix.locate import locate_file
-        from rayfix_service.adapters.adapted import station_map
+        from rayfix_service.adapters.adapted import known_height, station_map
     answers = locate_file(
         options.table,
         options.report,
         input_format=options.format,
         output_format=options.output,
         stations=station_map(options.station),
+        height=known_height(*(options.height or (None, None))),
     )
     for document in answers:
         if options.json or options.output != "native":
@@ -268,7 +276,7 @@ def _serve(options: argparse.Namespace) -> int:
 def _mqtt(options: argparse.Namespace) -> int:
     with needs_extra("mqtt"):
         from rayfix.mqtt import serve_mqtt
-        from rayfix_service.adapters.adapted import station_map
+        from rayfix_service.adapters.adapted import known_height, station_map
         from rayfix_service.adapters.mqtt import MqttSettings, parse_broker
     broker = parse_broker(
         options.broker,
@@ -283,6 +291,7 @@ def _mqtt(options: argparse.Namespace) -> int:
         window=options.window,
         stations=station_map(options.station),
         frame=options.frame,
+        height=known_height(*(options.height or (None, None))),
     )
     serve_mqtt(options.table, broker, settings)
     return 0

@@ -8,6 +8,7 @@ from typing import Any
 from rayfix_service.adapters.adapted import error_in_message
 from rayfix_service.adapters.formats import InputFormat, OutputFormat, parse, write
 from rayfix_service.fusion.locator import Locator
+from rayfix_service.fusion.report import Height
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
 
@@ -19,6 +20,7 @@ def locate_file(
     input_format: InputFormat = "native",
     output_format: OutputFormat = "native",
     stations: Mapping[str, str] | None = None,
+    height: Height | None = None,
 ) -> list[dict[str, Any]]:
     """Answer a file as the HTTP interface would: with one position, or for u-blox lines with as many as they tell of.
 
@@ -29,6 +31,8 @@ def locate_file(
         Formats of docs/formats.md.
     stations : Mapping, optional
         Stations by the names that the file has for them.
+    height : Height, optional
+        What is known of the target's height, for reports that say nothing of it.
 
     Raises
     ------
@@ -45,7 +49,7 @@ def locate_file(
     locator = Locator(table)
     answers = []
     try:
-        for adapted in parse(body, input_format, stations):
+        for adapted in parse(body, input_format, stations=stations, height=height):
             begin = time.perf_counter()
             try:
                 fix = locator.locate(adapted.report)

@@ -24,6 +24,7 @@ from rayfix_service.adapters.mqtt import Broker, BrokerError, MqttSettings, chec
 from rayfix_service.adapters.silabs import parse_silabs
 from rayfix_service.adapters.silabs_stream import SilabsStream
 from rayfix_service.fusion.locator import Locator
+from rayfix_service.fusion.report import Height
 from rayfix_service.http.examples import SILABS_EXAMPLES
 from rayfix_tables.table import Table
 
@@ -312,7 +313,7 @@ def test_settings_that_cannot_work_are_refused(changes: dict[str, Any], words: s
 
 
 def test_a_packet_that_all_stations_heard_does_not_wait(locator: Locator):
-    stream = SilabsStream(locator.table.site, window=1000.0)
+    stream = SilabsStream(locator.table.site, window=1000.0, height=Height(z=1.2, stdev=0.1))
     payload = json.dumps({"azimuth": 1, "azimuth_stdev": 1, "sequence": 3}).encode()
     reports = [
         report
@@ -322,6 +323,7 @@ def test_a_packet_that_all_stations_heard_does_not_wait(locator: Locator):
     (adapted,) = reports
     assert [m.station_id for m in adapted.report.measurements] == ["bs1", "bs2", "bs3", "bs4"]
     assert adapted.report.target_id == "tag"
+    assert adapted.report.height == Height(z=1.2, stdev=0.1)
     assert stream.receive("short", payload, 5.0) == []
     stream.receive("any/bs1/tag", payload.replace(b"3", b"4"), 6.0)
     assert stream.due(1005.0) == []

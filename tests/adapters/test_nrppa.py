@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rayfix_service.adapters.nrppa import parse_nrppa
-from rayfix_service.fusion.report import Angle, Range, TimeOfArrival
+from rayfix_service.fusion.report import Angle, Height, Range, TimeOfArrival
 from rayfix_service.wire import InvalidReportError, MalformedJsonError
 
 TC_M = 299_792_458 / (480_000 * 4096)  # m
@@ -128,6 +128,7 @@ def test_a_translation_is_the_rotation_of_tr_38_901(translation: tuple[int, int,
     about = np.angle(np.exp(1j * (turned_azimuth[1:] - turned_azimuth[0])))
     assert measured.azimuth_stdev == pytest.approx(about.std(), rel=0.015)
     assert measured.zenith_stdev == pytest.approx(turned_zenith[1:].std(), rel=0.015)
+    assert measured.correlation == pytest.approx(np.corrcoef(about, turned_zenith[1:])[0, 1], abs=0.01)
 
 
 def test_several_angles_of_one_trp_are_several_measurements():
@@ -228,6 +229,21 @@ def test_a_measurement_report_is_as_good():
     assert parse_nrppa(report).report == parse_nrppa(response).report
     assert parse_nrppa(report).report.target_id == "ue"
     assert parse_nrppa(report).report.timestamp == "2026-01-31T10:00:00Z"
+
+
+def test_a_known_height_is_passed_on():
+    document = message(item({"uL-AngleOfArrival": aoa(412, 1035)}), height={"z_m": 1.2, "stdev_m": 0.1})
+    assert parse_nrppa(document).report.height == Height(z=1.2, stdev=0.1)
+    with pytest.raises(InvalidReportError, match=r"height\.stdev_m is 0; give a positive standard deviation"):
+        parse_nrppa({**document, "height": {"z_m": 1.2, "stdev_m": 0}})
+
+
+def test_right_at_the_zenith_an_azimuth_is_unknown():
+    # Azimuth 0.05 and zenith 90.05 deg, turned by 270.1 deg about y: 0.07 deg from straight up.
+    measured = only(message(item({"uL-AngleOfArrival": aoa(0, 900, (0, 2701, 0))}, angle_quality(10, 10))))
+    assert measured.zenith < math.radians(0.2)
+    assert 1.0 < measured.azimuth_stdev <= 2 * math.pi
+    assert abs(measured.correlation) <= 0.999
 
 
 def test_the_messages_own_map_comes_first():

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rayfix_service.adapters.silabs import parse_silabs, parse_silabs_angle
-from rayfix_service.fusion.report import Angle, Range
+from rayfix_service.fusion.report import Angle, Height, Range
 from rayfix_service.wire import InvalidReportError, MalformedJsonError
 
 # As aoa_serialize_angle writes it.
@@ -68,6 +68,11 @@ def test_deviations_have_a_floor():
     angle, _ = parse_silabs(document).report.measurements
     assert isinstance(angle, Angle)
     assert angle.azimuth_stdev == math.radians(2.0)
+
+
+def test_a_known_height_is_passed_on():
+    report = parse_silabs(message(PAYLOAD, height={"z_m": 1.2, "stdev_m": 0.1})).report
+    assert report.height == Height(z=1.2, stdev=0.1)
 
 
 def test_angles_may_be_of_another_frame():

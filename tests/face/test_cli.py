@@ -96,6 +96,14 @@ def test_locate_takes_and_gives_other_formats(
     assert out.startswith("TAG1:\n")
     assert "TAG2:\n" in out
 
+    status, out, err = run(capsys, *command, "--json", "--height", "1.5", "0.01")
+    assert (status, err) == (0, "")
+    for line in out.splitlines():
+        assert json.loads(line)["position"]["z"] == pytest.approx(1.5, abs=0.03)
+    status, _, err = run(capsys, *command, "--height", "1.5", "-1")
+    assert status == 2
+    assert "height is 1.5 m with a standard deviation of -1.0 m; give both numbers" in one_line(err)
+
     status, _, err = run(capsys, *command[:5])
     assert status == 2
     assert "lines.txt: lines[0]: station 'A1' is not in the table" in one_line(err)

@@ -119,6 +119,15 @@ def test_one_bad_transmission_leaves_the_others_alone(client: Client):
     assert better["position"] == good["position"]
 
 
+def test_a_known_height_moves_the_fix_there(client: Client):
+    (plain,) = client.post("/v1/positions/ublox", LINES).json()["results"]
+    (fixed,) = client.post("/v1/positions/ublox?height_m=1.5&height_stdev_m=0.01", LINES).json()["results"]
+    assert fixed["position"]["z"] == pytest.approx(1.5, abs=0.03)
+    assert fixed["vertical_accuracy_m"] < 0.02 < plain["vertical_accuracy_m"]
+    message = {**SILABS, "height": {"z_m": 1.5, "stdev_m": 0.01}}
+    assert client.post("/v1/positions/silabs", message).json()["position"]["z"] == pytest.approx(1.5, abs=0.03)
+
+
 @pytest.mark.parametrize(
     ("path", "body", "status", "field", "words"),
     [
@@ -128,6 +137,7 @@ def test_one_bad_transmission_leaves_the_others_alone(client: Client):
         ("/v1/positions/ublox", NRPPA, 415, None, "text/plain"),
         ("/v1/positions/ublox", "OK", 422, None, "no line begins with +UUDF:"),
         ("/v1/positions/ublox?station=a", LINES, 422, "station", "NAME=STATION"),
+        ("/v1/positions/ublox?height_m=1", LINES, 422, "height", "give both numbers"),
         ("/v1/positions/silabs", {**SILABS, "angles": []}, 422, "angles", "an array of 1 to 256 angles"),
     ],
 )

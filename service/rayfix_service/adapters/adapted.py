@@ -1,10 +1,13 @@
 """A foreign message as a report of this project, with the way back to its fields."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from rayfix_service.fusion.report import Measurement, Report
+from pydantic import ValidationError
+
+from rayfix_service.fusion.report import Height, Measurement, Report
 from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportError
+from rayfix_service.wire.documents import HeightDocument
 from rayfix_service.wire.problems import Path, path_text
 from rayfix_tables.errors import ReportError
 
@@ -49,6 +52,7 @@ def adapted_report(
     *,
     target_id: str | None,
     timestamp: str | None,
+    height: Height | None = None,
 ) -> Adapted:
     """Put measurements and what was left out together.
 
@@ -68,7 +72,9 @@ def adapted_report(
         text = f"the message has {len(measurements)} measurements; give at most {MAX_MEASUREMENTS} at once"
         raise InvalidReportError((FieldProblem(path=(), message=text),))
     return Adapted(
-        report=Report(measurements=tuple(m for _, m in measurements), target_id=target_id, timestamp=timestamp),
+        report=Report(
+            measurements=tuple(m for _, m in measurements), height=height, target_id=target_id, timestamp=timestamp
+        ),
         sources=tuple(path for path, _ in measurements),
         skipped=tuple(skipped),
     )
@@ -77,6 +83,13 @@ def adapted_report(
 def station_of(name: str, *maps: Mapping[str, str] | None) -> str:
     """Return the station that another system calls `name`: what the first map with it says, else the name itself."""
     return next((stations[name] for stations in maps if stations and name in stations), name)
+
+
+def with_height(adapted: Adapted, height: Height | None) -> Adapted:
+    """Add what is known of the target's height to a report that says nothing of it."""
+    if height is None or adapted.report.height is not None:
+        return adapted
+    return replace(adapted, report=replace(adapted.report, height=height))
 
 
 def error_in_message(error: ReportError, adapted: Adapted) -> InvalidReportError:
@@ -105,3 +118,22 @@ def station_map(pairs: Iterable[str]) -> dict[str, str]:
             )
         stations[name] = station
     return stations
+
+
+def known_height(z: float | None, stdev: float | None) -> Height | None:
+    """Read the height and its standard deviation, m, of the command line or of a query, where they are given.
+
+    Raises
+    ------
+    ReportError
+        When a number is out of range.
+    """
+    if z is None and stdev is None:
+        return None
+    try:
+        return HeightDocument.model_validate({"z_m": z, "stdev_m": stdev}).height()
+    except ValidationError:
+        text = (
+            f"height is {z} m with a standard deviation of {stdev} m; give both numbers, 0.001 or more for the second"
+        )
+        raise ReportError(text, path=("height",)) from None

@@ -6,10 +6,11 @@ from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError
 from pydantic.fields import FieldInfo
-from pydantic_core import ErrorDetails, PydanticCustomError
+from pydantic_core import ErrorDetails
 
 from rayfix_service.wire import FieldProblem, InvalidReportError, WireModel, path_text, read_json
-from rayfix_service.wire.fields import MISFIT, Rfc3339
+from rayfix_service.wire.documents import HeightDocument
+from rayfix_service.wire.fields import MISFIT, Rfc3339, misfit
 from rayfix_service.wire.problems import Path, shown
 
 _MAX_PROBLEMS = 50
@@ -44,6 +45,11 @@ Timestamp = Annotated[
         description='an RFC 3339 date-time such as "2026-01-31T10:00:00.250Z"',
         json_schema_extra={"format": "date-time"},
     ),
+]
+
+KnownHeight = Annotated[
+    HeightDocument | None,
+    Field(description='an object such as {"z_m": 1.2, "stdev_m": 0.1}: the known height of the target'),
 ]
 
 
@@ -93,11 +99,6 @@ def one_of(model: WireModel) -> tuple[str, Any]:
     found = " and ".join(name for name, _ in given) or "nothing"
     names = ", ".join(field.alias or name for name, field in fields.items())
     raise misfit(None, f"holds {found}; give exactly one of {names}")
-
-
-def misfit(field: str | None, text: str) -> PydanticCustomError:
-    """Return the error of fields that do not fit together; `field` is the one to point at, if any."""
-    return PydanticCustomError(MISFIT, "{text}", {"text": text, "field": field})
 
 
 def _problem(root: type[WireModel], error: ErrorDetails, what: str) -> FieldProblem:

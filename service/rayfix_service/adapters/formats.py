@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from rayfix_service.adapters.adapted import Adapted
+from rayfix_service.adapters.adapted import Adapted, with_height
 from rayfix_service.adapters.nrppa import parse_nrppa
 from rayfix_service.adapters.omlox import fix_to_omlox
 from rayfix_service.adapters.silabs import parse_silabs
 from rayfix_service.adapters.threegpp import fix_to_3gpp
 from rayfix_service.adapters.ublox import parse_ublox
-from rayfix_service.fusion.report import Fix
+from rayfix_service.fusion.report import Fix, Height
 from rayfix_service.wire import fix_to_document, parse_report
 from rayfix_service.wire.problems import path_text
 from rayfix_tables.site import SiteInfo
@@ -18,7 +18,13 @@ InputFormat = Literal["native", "nrppa", "silabs", "ublox"]
 OutputFormat = Literal["native", "3gpp", "omlox"]
 
 
-def parse(body: bytes, input_format: InputFormat, stations: Mapping[str, str] | None = None) -> tuple[Adapted, ...]:
+def parse(
+    body: bytes,
+    input_format: InputFormat,
+    *,
+    stations: Mapping[str, str] | None = None,
+    height: Height | None = None,
+) -> tuple[Adapted, ...]:
     """Turn a message into reports: one, or for u-blox lines as many as they tell of.
 
     Parameters
@@ -28,6 +34,8 @@ def parse(body: bytes, input_format: InputFormat, stations: Mapping[str, str] | 
     input_format : {"native", "nrppa", "silabs", "ublox"}
     stations : Mapping, optional
         Stations by the names that the message has for them; the native format has the stations' own.
+    height : Height, optional
+        What is known of the target's height, for messages that say nothing of it.
 
     Raises
     ------
@@ -36,6 +44,10 @@ def parse(body: bytes, input_format: InputFormat, stations: Mapping[str, str] | 
     InvalidReportError
         For a message that is not valid.
     """
+    return tuple(with_height(adapted, height) for adapted in _parse(body, input_format, stations))
+
+
+def _parse(body: bytes, input_format: InputFormat, stations: Mapping[str, str] | None) -> tuple[Adapted, ...]:
     match input_format:
         case "native":
             report = parse_report(body)

@@ -16,7 +16,7 @@ from rayfix_service.adapters.adapted import Adapted
 from rayfix_service.adapters.formats import OutputFormat, write
 from rayfix_service.adapters.silabs_stream import SilabsStream
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import Frame
+from rayfix_service.fusion.report import Frame, Height
 from rayfix_tables.errors import RayfixError, ReportError
 
 _log = logging.getLogger(__name__)
@@ -58,6 +58,8 @@ class MqttSettings:
         Stations by locator, for those that are not stations' identifiers.
     frame : {"lcs", "scene", "north"}
         Frame of the angles.
+    height : Height or None
+        What is known of the height of all tags.
     """
 
     topic: str = "silabs/aoa/angle/+/+"
@@ -66,6 +68,7 @@ class MqttSettings:
     window: float = 0.5
     stations: Mapping[str, str] = field(default_factory=dict)
     frame: Frame = "lcs"
+    height: Height | None = None
 
 
 def parse_broker(text: str, *, tls: bool = False, username: str | None = None, password: str | None = None) -> Broker:
@@ -131,7 +134,13 @@ async def run_mqtt(
         When a setting is out of range, or the first connection fails.
     """
     check_settings(settings)
-    stream = SilabsStream(locator.table.site, window=settings.window, stations=settings.stations, frame=settings.frame)
+    stream = SilabsStream(
+        locator.table.site,
+        window=settings.window,
+        stations=settings.stations,
+        frame=settings.frame,
+        height=settings.height,
+    )
     place = f"{broker.host}:{broker.port}"
     connected, pause = False, 1.0
     while True:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,9 +21,11 @@ from rayfix_service.adapters.nrppa_documents import (
     Zoa,
 )
 from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_interval, time_interval
+from rayfix_service.fusion.directions import to_scene
 from rayfix_service.fusion.report import Angle, Measurement, Range, TimeOfArrival
 from rayfix_service.wire.problems import Path
-from rayfix_tables.angles import angles_of, direction, local_to_scene, wrap
+from rayfix_tables.angles import wrap
+from rayfix_tables.site import Station
 
 _RESOLUTION_M = {"m0dot1": 0.1, "mdot1": 0.1, "m1": 1.0, "m10": 10.0, "m30": 30.0}
 
@@ -73,7 +75,13 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
                     skipped.append(Skipped(path=(*path, *place), reason=outcome))
                 else:
                     measurements.append(((*path, *place), outcome))
-    return adapted_report(measurements, skipped, target_id=document.target_id, timestamp=document.timestamp)
+    return adapted_report(
+        measurements,
+        skipped,
+        target_id=document.target_id,
+        timestamp=document.timestamp,
+        height=None if document.height is None else document.height.height(),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,17 +138,15 @@ class _Converter:
         zenith = angle_interval(measured.zenith)
         known = quality.zenith if quality else None
         zenith_stdev = math.sqrt((default if known is None else _steps(known) * ANGLE_STEP) ** 2 + zenith.variance)
-        angles = (float(wrap(azimuth.middle)), zenith.middle, azimuth_stdev, zenith_stdev)
-        if measured.translation is not None:
-            angles = _to_global(measured.translation, *angles)
-        return Angle(
+        angle = Angle(
             station_id=self.station_id,
-            azimuth=angles[0],
-            zenith=angles[1],
-            azimuth_stdev=angles[2],
-            zenith_stdev=angles[3],
+            azimuth=float(wrap(azimuth.middle)),
+            zenith=zenith.middle,
+            azimuth_stdev=azimuth_stdev,
+            zenith_stdev=zenith_stdev,
             frame="north",
         )
+        return angle if measured.translation is None else _to_global(measured.translation, angle)
 
     def _arrival(self, time: TimeChoice, quality: TimingQuality | None) -> TimeOfArrival | str:
         measured = time_interval(*time.value_and_k())
@@ -181,34 +187,23 @@ def _steps(quality: int) -> float:
     return max(float(quality), 0.5)
 
 
-def _to_global(
-    translation: LcsToGcs, azimuth: float, zenith: float, azimuth_stdev: float, zenith_stdev: float
-) -> tuple[float, float, float, float]:
-    """Turn angles of a local coordinate system, and their deviations, by TR 38.901, equation (7.1-2).
-
-    The turned errors of azimuth and zenith are correlated unless beta and gamma are 0; a report holds deviations
-    alone, so that the correlation is left out.
-    """
+def _to_global(translation: LcsToGcs, angle: Angle) -> Angle:
+    """Turn an angle of a local coordinate system, and its covariance, by TR 38.901, equation (7.1-2)."""
     orientation = (
         translation.alpha * ANGLE_STEP,
         translation.beta * ANGLE_STEP,
         translation.gamma * ANGLE_STEP,
     )
-    rotation = local_to_scene(orientation)
-    turned_azimuth, turned_zenith = (float(v) for v in angles_of(rotation @ direction(azimuth, zenith)))
-    along = (
-        np.array([-np.sin(azimuth), np.cos(azimuth), 0.0]) * np.sin(zenith),
-        np.array([np.cos(zenith) * np.cos(azimuth), np.cos(zenith) * np.sin(azimuth), -np.sin(zenith)]),
+    trp = Station(id=angle.station_id, position=(0.0, 0.0, 0.0), orientation=orientation)
+    turned = to_scene(replace(angle, frame="lcs"), trp, 0.0)
+    assert turned.azimuth is not None
+    stdev = np.sqrt(np.diag(turned.cov))
+    return replace(
+        angle,
+        azimuth=turned.azimuth,
+        zenith=turned.zenith,
+        # Beyond a full turn an azimuth is unknown, which is the case right at the zenith.
+        azimuth_stdev=min(float(stdev[0]), 2.0 * np.pi),
+        zenith_stdev=float(stdev[1]),
+        correlation=float(np.clip(turned.cov[0, 1] / (stdev[0] * stdev[1]), -0.999, 0.999)),
     )
-    to_azimuth = np.array([-np.sin(turned_azimuth), np.cos(turned_azimuth), 0.0]) / max(np.sin(turned_zenith), 1e-9)
-    to_zenith = np.array(
-        [
-            np.cos(turned_zenith) * np.cos(turned_azimuth),
-            np.cos(turned_zenith) * np.sin(turned_azimuth),
-            -np.sin(turned_zenith),
-        ]
-    )
-    errors = np.stack([rotation @ along[0] * azimuth_stdev, rotation @ along[1] * zenith_stdev], axis=-1)
-    # Beyond a full turn an azimuth is unknown, which is the case right at the zenith.
-    stdev_azimuth = min(float(np.linalg.norm(to_azimuth @ errors)), 2.0 * np.pi)
-    return turned_azimuth, turned_zenith, stdev_azimuth, float(np.linalg.norm(to_zenith @ errors))

@@ -9,9 +9,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
-from rayfix_service.adapters.documents import Stations, TargetId, Timestamp, integer, misfit, not_used, one_of
+from rayfix_service.adapters.documents import KnownHeight, Stations, TargetId, Timestamp, integer, not_used, one_of
 from rayfix_service.adapters.report_mapping import largest_time_value
 from rayfix_service.wire import MAX_MEASUREMENTS, WireModel
+from rayfix_service.wire.fields import misfit
 
 _Tenths = integer(3599, "an angle in 0.1 deg")
 _Azimuth = integer(3599, "an azimuth in 0.1 deg")
@@ -288,6 +289,7 @@ class NrppaDocument(WireModel):
     target_id: TargetId = None
     timestamp: Timestamp = None
     stations: Stations = None
+    height: KnownHeight = None
     azimuth_zero_deg: Literal[0, -180] = Field(
         default=0, description="0 or -180, the azimuth in degrees at which azimuthAoA = 0 begins"
     )

@@ -11,9 +11,10 @@ from typing import Annotated, Any, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from rayfix_service.adapters.adapted import Adapted, adapted_report, station_of
-from rayfix_service.adapters.documents import Stations, TargetId, Timestamp, check, misfit
+from rayfix_service.adapters.documents import KnownHeight, Stations, TargetId, Timestamp, check
 from rayfix_service.fusion.report import Angle, Frame, Measurement, Range
 from rayfix_service.wire import MAX_MEASUREMENTS, WireModel
+from rayfix_service.wire.fields import misfit
 from rayfix_service.wire.problems import Path
 from rayfix_tables.angles import wrap
 
@@ -62,6 +63,7 @@ class SilabsDocument(WireModel):
     target_id: TargetId = None
     timestamp: Timestamp = None
     stations: Stations = None
+    height: KnownHeight = None
     frame: Frame = Field(default="lcs", description='one of "lcs", "scene" and "north", the frame of the angles')
     least_stdev_deg: float = Field(
         default=LEAST_STDEV_DEG, ge=1e-6, le=360, description="the least standard deviation to believe, 1e-06 to 360"
@@ -95,7 +97,13 @@ def parse_silabs(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, s
         station_id = station_of(angle.locator_id, document.stations, stations)
         found = silabs_measurements(angle, station_id, frame=document.frame, least_stdev_deg=document.least_stdev_deg)
         measurements += [(("angles", n), one) for one in found]
-    return adapted_report(measurements, [], target_id=document.target_id, timestamp=document.timestamp)
+    return adapted_report(
+        measurements,
+        [],
+        target_id=document.target_id,
+        timestamp=document.timestamp,
+        height=None if document.height is None else document.height.height(),
+    )
 
 
 def parse_silabs_angle(payload: bytes) -> SilabsAngle:

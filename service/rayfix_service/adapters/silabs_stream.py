@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from rayfix_service.adapters.adapted import Adapted, adapted_report, station_of
 from rayfix_service.adapters.joining import Joiner, Transmission
 from rayfix_service.adapters.silabs import LEAST_STDEV_DEG, SilabsAngle, parse_silabs_angle, silabs_measurements
-from rayfix_service.fusion.report import Frame
+from rayfix_service.fusion.report import Frame, Height
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo
 
@@ -31,6 +31,8 @@ class SilabsStream:
         Frame of the angles.
     least_stdev_deg : float, deg
         Least standard deviation to believe.
+    height : Height, optional
+        What is known of the height of all tags.
     """
 
     def __init__(
@@ -41,12 +43,14 @@ class SilabsStream:
         stations: Mapping[str, str] | None = None,
         frame: Frame = "lcs",
         least_stdev_deg: float = LEAST_STDEV_DEG,
+        height: Height | None = None,
     ) -> None:
         self._known = {station.id for station in site.stations}
         self._joiner: Joiner[tuple[datetime, SilabsAngle]] = Joiner(window=window, num_stations=len(self._known))
         self._stations = stations
         self._frame: Frame = frame
         self._least_stdev_deg = least_stdev_deg
+        self._height = height
         self._told: set[str] = set()
 
     def receive(self, topic: str, payload: bytes, now: float) -> list[Adapted]:
@@ -85,7 +89,9 @@ class SilabsStream:
         ]
         first = min(moment for moment, _ in transmission.heard.values())
         timestamp = first.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        return adapted_report(list(measurements), [], target_id=transmission.target, timestamp=timestamp)
+        return adapted_report(
+            list(measurements), [], target_id=transmission.target, timestamp=timestamp, height=self._height
+        )
 
     def _tell(self, source: str, text: str) -> None:
         level = logging.DEBUG if source in self._told else logging.WARNING

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
-from rayfix_service.adapters.adapted import Adapted, station_map
+from rayfix_service.adapters.adapted import known_height, station_map, with_height
 from rayfix_service.adapters.nrppa import parse_nrppa
 from rayfix_service.adapters.nrppa_documents import NrppaDocument
 from rayfix_service.adapters.silabs import SilabsDocument, parse_silabs
@@ -78,16 +78,14 @@ async def post_ublox(
     body: LinesBody,
     output: Output = "native",
     station: Annotated[list[str], Query(description="ANCHOR=STATION, for anchors whose id is no station's")] = [],  # noqa: B006
+    height_m: Annotated[float | None, Query(description="known height of the tags, z in the scene frame, m")] = None,
+    height_stdev_m: Annotated[float | None, Query(description="its standard deviation, m")] = None,
 ) -> JSONResponse:
     """Take ``+UUDF`` lines of u-blox anchors and join them by tag and sequence number."""
-    results = []
+    known, results = known_height(height_m, height_stdev_m), []
     for adapted in parse_ublox(body, stations=station_map(station)):
         if await request.is_disconnected():
             raise ProblemError(CONNECTION_ENDED, "the connection ended before the answer")
-        results.append(await answerer.answer_or_problem(partial(_same, adapted), output))
+        results.append(await answerer.answer_or_problem(partial(with_height, adapted, known), output))
         await asyncio.sleep(0)
     return JSONResponse({"results": results})
-
-
-def _same(adapted: Adapted) -> Adapted:
-    return adapted
