@@ -328,3 +328,13 @@ def test_a_packet_that_all_stations_heard_does_not_wait(locator: Locator):
     stream.receive("any/bs1/tag", payload.replace(b"3", b"4"), 6.0)
     assert stream.due(1005.0) == []
     assert len(stream.due(1006.0)) == 1
+
+
+def test_without_the_extra_the_command_says_which(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], hall_table_path: Path
+):
+    for name in ("rayfix.mqtt", "rayfix_service.adapters.mqtt"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setitem(sys.modules, "aiomqtt", None)
+    assert main(["mqtt", str(hall_table_path)]) == 2
+    assert "'aiomqtt' is not installed; install it with: pip install 'rayfix[mqtt]'" in capsys.readouterr().err

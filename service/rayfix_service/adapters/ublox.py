@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -74,15 +75,15 @@ def parse_uudf(line: str) -> UudfEvent:
     text = line.strip()
     if not text.startswith(_PREFIX):
         raise _invalid(f"is {shown(text)}; give a line that begins with {_PREFIX}")
-    fields = next(csv.reader([text.removeprefix(_PREFIX)], skipinitialspace=True))
+    try:
+        fields = next(csv.reader([text.removeprefix(_PREFIX)], skipinitialspace=True))
+    except csv.Error as error:
+        raise _invalid(f"cannot be split into fields ({error}); give it as the anchor wrote it") from None
     if len(fields) not in (9, 10):
         raise _invalid(f"has {len(fields)} fields; give 9, or 10 with the sequence number")
     numbers: dict[int, int] = {}
     for index, name, low, high in _INTEGERS[: len(fields) - 3]:
-        try:
-            numbers[index] = int(fields[index])
-        except ValueError:
-            numbers[index] = low - 1
+        numbers[index] = int(fields[index]) if re.fullmatch("-?[0-9]{1,20}", fields[index]) else low - 1
         if not low <= numbers[index] <= high:
             raise _invalid(f"has {name} {shown(fields[index])}; give an integer from {low} to {high}")
     for index, name in ((0, "instance id"), (6, "anchor id")):
