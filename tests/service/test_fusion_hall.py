@@ -334,6 +334,19 @@ def test_one_wide_angle_alone_is_no_position(hall: Hall) -> None:
         assert len(fix.candidates) > 3
 
 
+@pytest.mark.parametrize(("stdev_deg", "within"), [(0.05, 0.1), (25.0, 3.0)])
+def test_from_the_best_angles_to_the_worst(hall: Hall, stdev_deg: float, within: float) -> None:
+    """Angles of a laser, and of a room's corner: half of the fixes are that near, and they know how near they are."""
+    apart, known = [], []
+    for n in range(0, 100, 3):
+        candidate = best(hall.locator.locate(hall.report(n, "pt", stdev_deg)))
+        error = candidate.position - hall.drops[n].position
+        apart.append(float(np.linalg.norm(error)))
+        known.append(error @ np.linalg.solve(candidate.covariance, error) < 16.0)
+    assert np.median(apart) < within
+    assert np.mean(known) > 0.7
+
+
 def test_a_station_that_reports_nonsense_is_told_and_left_out(hall: Hall) -> None:
     """A random angle and a range 10 m too long from one of four stations."""
     rng = np.random.default_rng(5)

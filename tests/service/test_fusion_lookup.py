@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.lookup import NO_DIRECTION, Direction, Lookup, look_up
-from rayfix_tables.angles import wrap
+from rayfix_tables.angles import angles_of, local_to_scene, wrap
+from rayfix_tables.angles import direction as direction_of
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture
@@ -186,6 +187,64 @@ def test_a_wide_angle_is_a_sum_of_cells(stdev_deg: tuple[float, float], azimuth:
     # Per steradian.
     expected = np.exp(log_normal(apart, np.diag(stdev**2))) / sine
     np.testing.assert_allclose(represented(lookup, around, up)[near], expected[near], rtol=0.08)
+
+
+@pytest.mark.parametrize("stdev_deg", [(12.1, 13.0), (20.0, 30.0), (40.0, 10.0), (2.0, 20.0)])
+@pytest.mark.parametrize("correlation", [-0.95, -0.5, 0.3, 0.9])
+@pytest.mark.parametrize("azimuth", [0.3, np.pi])
+def test_a_wide_correlated_angle_is_a_sum_of_cells(
+    stdev_deg: tuple[float, float], correlation: float, azimuth: float
+) -> None:
+    stdev, zenith = np.deg2rad(stdev_deg), 1.4
+    cov = np.multiply.outer(stdev, stdev) * np.array([[1.0, correlation], [correlation, 1.0]])
+    around, up = directions(40_000, np.deg2rad(35.0))
+    apart = np.stack([wrap(around - azimuth), up - zenith], axis=-1)
+    near = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(cov), apart) < 4.0
+    assert near.sum() > 50
+    lookup = look_up(LEVELS, Direction(azimuth=azimuth, zenith=zenith, cov=cov))
+    rings = lookup.level.grid.num_rings
+    sine = np.sin((np.floor(zenith * rings / np.pi) + 0.5) * np.pi / rings)
+    expected = np.exp(log_normal(apart, cov)) / sine
+    found = represented(lookup, around, up)
+    np.testing.assert_allclose(found[near], expected[near], rtol=0, atol=0.15 * expected.max())
+    assert np.abs(found - expected)[near].mean() < 0.04 * expected.max()
+    # Without the correlation it would be another likelihood.
+    other = np.exp(log_normal(apart, np.diag(stdev**2))) / sine
+    assert np.abs(other - expected)[near].mean() > np.abs(found - expected)[near].mean()
+
+
+@pytest.mark.parametrize("tilt_deg", [(20.0, 30.0, 0.0), (-100.0, 10.0, 25.0), (0.0, 0.0, 90.0)])
+@pytest.mark.parametrize("stdev_deg", [1.0, 5.0, 20.0])
+@pytest.mark.parametrize("azimuth", [0.3, np.pi])
+def test_an_azimuth_alone_in_a_tilted_frame(
+    tilt_deg: tuple[float, float, float], stdev_deg: float, azimuth: float
+) -> None:
+    """Seen from the tilted frame it is as any azimuth."""
+    a, b, c = (float(angle) for angle in np.deg2rad(tilt_deg))
+    rotation, stdev = local_to_scene((a, b, c)), float(np.deg2rad(stdev_deg))
+    around, up = directions(40_000, np.deg2rad(25.0))
+    seen_azimuth, seen_zenith = angles_of(direction_of(around, up) @ rotation)
+    apart = wrap(azimuth - seen_azimuth)
+    expected = np.exp(-0.5 * (apart / stdev) ** 2) / (np.sqrt(2.0 * np.pi) * stdev)
+    lookup = look_up(LEVELS, Direction(azimuth=azimuth, zenith=None, cov=np.diag([stdev**2, np.inf]), tilt=rotation))
+    found = represented(lookup, around, up)
+    # Far from the tilted frame's poles, where azimuths crowd.
+    there = np.abs(seen_zenith - 0.5 * np.pi) < np.deg2rad(50.0)
+    assert np.abs(found - expected)[there & (expected > 0.01 * expected.max())].mean() < 0.04 * expected.max()
+    assert np.abs(found - expected)[there].max() < 0.25 * expected.max()
+
+
+@pytest.mark.parametrize(("inside", "level"), [(0.999, 0), (1.001, 1)])
+def test_on_either_side_of_a_switch_of_levels_the_likelihood_is_the_same(inside: float, level: int) -> None:
+    azimuth, zenith, stdev_deg = 0.7, 1.3, inside * 1.0
+    lookup = look_up(LEVELS, measured(azimuth, zenith, (stdev_deg, stdev_deg, 0.0)))
+    assert lookup.level is LEVELS[level]
+    apart = np.random.default_rng(0).standard_normal((200, 2)) * np.deg2rad(stdev_deg)
+    found = represented(lookup, azimuth + apart[:, 0], zenith + apart[:, 1])
+    rings = lookup.level.grid.num_rings
+    sine = np.sin((np.floor(zenith * rings / np.pi) + 0.5) * np.pi / rings)
+    expected = np.exp(log_normal(apart * [sine, 1.0], np.diag([sine, 1.0]) ** 2 * np.deg2rad(stdev_deg) ** 2))
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("zenith", [0.0, 0.02, np.pi])

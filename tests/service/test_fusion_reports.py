@@ -23,7 +23,7 @@ from rayfix_service.fusion.report import (
     TimeDifference,
     TimeOfArrival,
 )
-from rayfix_tables.angles import direction, wrap
+from rayfix_tables.angles import direction, local_to_scene, wrap
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station, StationBias
 
@@ -169,7 +169,13 @@ def test_an_azimuth_alone_has_a_frame_too() -> None:
     found = turned(30.0, None, frame="lcs", orientation_deg=(45.0, 0.0, 0.0))
     assert found.azimuth == pytest.approx(np.deg2rad(75.0))
     assert found.zenith is None
+    assert found.tilt is None
     np.testing.assert_array_equal(found.cov, np.diag([np.deg2rad(1.0) ** 2, np.inf]))
+    tilted = turned(30.0, None, frame="lcs", orientation_deg=(45.0, 20.0, 0.0))
+    assert tilted.azimuth == pytest.approx(np.deg2rad(30.0))
+    bearing, downtilt = np.deg2rad([45.0, 20.0])
+    np.testing.assert_array_equal(tilted.tilt, local_to_scene((float(bearing), float(downtilt), 0.0)))
+    assert turned(30.0, None, frame="scene", orientation_deg=(45.0, 20.0, 0.0)).tilt is None
 
 
 def test_the_field_of_view_is_a_cone_around_the_stations_axis() -> None:

@@ -97,6 +97,8 @@ def _sorted(
         name = measurement.station_id
         if isinstance(measurement, Angle):
             directions[name] = to_scene(measurement, stations[name], site.north)
+            if directions[name].tilt is not None:
+                raise ReportError("the paper's method knows no azimuth in a tilted frame", path=("measurements",))
         elif isinstance(measurement, Range):
             ranges[name] = (measurement.path_length, measurement.stdev)
         elif isinstance(measurement, TimeOfArrival):

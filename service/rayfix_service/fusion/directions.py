@@ -51,8 +51,13 @@ def to_scene(angle: Angle, station: Station, north: float) -> Direction:
     """
     azimuth_variance = angle.azimuth_stdev**2
     if angle.zenith is None or angle.zenith_stdev is None:
-        turn = {"scene": 0.0, "north": north, "lcs": station.orientation[0]}[angle.frame]
-        return Direction(azimuth=angle.azimuth + turn, zenith=None, cov=np.diag([azimuth_variance, np.inf]))
+        bearing, *tilts = station.orientation
+        cov = np.diag([azimuth_variance, np.inf])
+        if angle.frame == "lcs" and any(tilts):
+            tilt = local_to_scene(station.orientation)
+            return Direction(azimuth=angle.azimuth, zenith=None, cov=cov, tilt=tilt)
+        turn = {"scene": 0.0, "north": north, "lcs": bearing}[angle.frame]
+        return Direction(azimuth=angle.azimuth + turn, zenith=None, cov=cov)
     covariance = angle.correlation * angle.azimuth_stdev * angle.zenith_stdev
     cov = np.array([[azimuth_variance, covariance], [covariance, angle.zenith_stdev**2]])
     if angle.frame == "scene":

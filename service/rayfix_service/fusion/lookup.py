@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_service.fusion.unity import sum_of_ellipse, sum_of_meridian
 from rayfix_tables.angles import wrap
 from rayfix_tables.level import WINDOW_RATIO, Level
 
@@ -27,6 +28,12 @@ _SUM_REACH = 3.0
 
 _LEAST_SPREAD = 0.6
 """Least standard deviation of the weights of a sum, in steps from cell to cell: narrower ones would not add up to 1."""
+
+_LEAST_CORRELATION = 1e-3
+"""Correlation of errors below which a sum along azimuths and zeniths leaves it aside."""
+
+_MERIDIAN_WINDOW = float(np.deg2rad(4.0))
+"""Narrower windows are not summed along a tilted meridian, which is straight enough over these."""
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 
@@ -41,11 +48,14 @@ class Direction:
         None when not measured.
     cov : ndarray of shape (2, 2), rad2
         Covariance of azimuth and zenith; infinite on the diagonal for what was not measured.
+    tilt : ndarray of shape (3, 3), optional
+        Of an azimuth alone in a frame whose z axis is not the scene's: takes that frame's vectors into the scene's.
     """
 
     azimuth: float | None
     zenith: float | None
     cov: NDArray[np.float64]
+    tilt: NDArray[np.float64] | None = None
 
 
 NO_DIRECTION = Direction(azimuth=None, zenith=None, cov=np.diag([np.inf, np.inf]))
@@ -93,6 +103,16 @@ def look_up(levels: tuple[Level, ...], measured: Direction) -> Lookup:
             if 0.5 * (hh + vv) + np.hypot(0.5 * (hh - vv), hv) <= _limit(level):
                 offset = (sine * float(wrap(measured.azimuth - azimuth)), measured.zenith - zenith)
                 return _single_cell(level, cell, offset, (hh, hv, vv))
+        correlation = measured.cov[0, 1] / np.sqrt(measured.cov[0, 0] * measured.cov[1, 1])
+        if abs(correlation) > _LEAST_CORRELATION:
+            level = levels[-1]
+            ellipse = sum_of_ellipse(level.grid, level.window, measured.azimuth, measured.zenith, measured.cov)
+            return Lookup(level=level, **ellipse._asdict())
+    elif measured.azimuth is not None and measured.tilt is not None:
+        stdev = float(np.sqrt(measured.cov[0, 0]))
+        level = next((level for level in levels if level.window >= max(_MERIDIAN_WINDOW, stdev)), levels[-1])
+        meridian = sum_of_meridian(level.grid, level.window, measured.azimuth, stdev, measured.tilt)
+        return Lookup(level=level, **meridian._asdict())
     return _cell_sum(levels[-1], measured)
 
 
@@ -123,7 +143,7 @@ def _single_cell(level: Level, cell: int, offset: tuple[float, float], noise: tu
 
 
 def _cell_sum(level: Level, measured: Direction) -> Lookup:
-    """Sum cells along the axes whose noise is too wide; a correlation of the noise is then left aside."""
+    """Sum cells along the axes whose noise is too wide, as if the errors were not correlated."""
     num_rings = level.grid.num_rings
     height = np.pi / num_rings
     zeniths = (np.arange(num_rings) + 0.5) * height
