@@ -1,12 +1,13 @@
 """Figures for Prometheus; docs/operations.md lists them."""
 
 import os
+from typing import get_args
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.exposition import choose_encoder
 from prometheus_client.multiprocess import MultiProcessCollector
 
-from rayfix_service.fusion.report import Fix
+from rayfix_service.fusion.report import Fix, Status
 from rayfix_tables.table import Table
 
 MULTIPROCESS_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
@@ -34,16 +35,19 @@ class Metrics:
             buckets=_SECONDS,
             registry=self._registry,
         )
-        self._fixes = Counter("rayfix_fixes", "Fixes by status", ("status",), registry=self._registry)
+        fixes = Counter("rayfix_fixes", "Fixes by status", ("status",), registry=self._registry)
+        # All that there can be is there from the start, at 0, so that a rate begins with the first.
+        self._fixes = {status: fixes.labels(status) for status in get_args(Status)}
         self._fusion_seconds = Histogram(
             "rayfix_fusion_seconds", "Time that a fix took to compute", buckets=_SECONDS, registry=self._registry
         )
-        self._measurements = Counter(
+        measurements = Counter(
             "rayfix_measurements",
             "Measurements by what became of them: used, outlier (used, and more likely wrong than not) or unused",
             ("outcome",),
             registry=self._registry,
         )
+        self._measurements = {name: measurements.labels(name) for name in ("used", "outlier", "unused")}
         self._table = Gauge(
             "rayfix_table_info",
             "1 for the table that answers",
@@ -64,11 +68,11 @@ class Metrics:
 
     def fix_done(self, fix: Fix, seconds: float) -> None:
         """Count a fix and its measurements."""
-        self._fixes.labels(fix.status).inc()
+        self._fixes[fix.status].inc()
         self._fusion_seconds.observe(seconds)
         for outcome in fix.outcomes:
             name = "unused" if not outcome.used else "outlier" if (outcome.outlier_probability or 0) > 0.5 else "used"
-            self._measurements.labels(name).inc()
+            self._measurements[name].inc()
 
     def table_opened(self, table: Table) -> None:
         """Tell which table answers."""
