@@ -216,6 +216,16 @@ def test_what_cannot_be_used_is_told(value: dict[str, Any], words: str):
     assert refused.value.path[-1] == kind
 
 
+@pytest.mark.parametrize("paths", ["additionalPathList", "ExtendedAdditionalPathList"])
+def test_additional_paths_are_skipped_and_told(paths: str):
+    value = {"uLRTOAmeas": {"k0": 985025}, paths: [{"relativeTimeOfPath": {"k0": 8300}}]}
+    adapted = parse_nrppa(message(item({"uL-RTOA": value})))
+    assert len(adapted.report.measurements) == 1
+    (skipped,) = adapted.skipped
+    assert skipped.path[-2:] == ("uL-RTOA", paths)
+    assert "MultipleULAoA" in skipped.reason
+
+
 @pytest.mark.parametrize("los", [{"loS-NLoSIndicatorSoft": 3}, {"loS-NLoSIndicatorHard": "nlos"}])
 def test_line_of_sight_changes_nothing(los: dict[str, Any]):
     plain = item({"uL-AngleOfArrival": aoa(412, 1035)})

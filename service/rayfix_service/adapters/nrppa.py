@@ -11,6 +11,7 @@ from rayfix_service.adapters.adapted import Adapted, Skipped, adapted_report, st
 from rayfix_service.adapters.documents import check, one_of
 from rayfix_service.adapters.nrppa_documents import (
     AngleQuality,
+    GnbRxTx,
     LcsToGcs,
     LppTimingQuality,
     NrppaDocument,
@@ -18,6 +19,7 @@ from rayfix_service.adapters.nrppa_documents import (
     TimeChoice,
     TimingQuality,
     UlAoa,
+    UlRtoa,
     Zoa,
 )
 from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_interval, time_interval
@@ -34,6 +36,7 @@ _NO_AZIMUTH = "a zenith angle without an azimuth cannot be used; report UL-AoA w
 _NO_ZENITH = "an azimuth without a zenith angle cannot be turned by beta and gamma; report zenithAoA as well"
 _ALONE = "a gNB's Rx-Tx time difference is a range only together with the UE's; give that in ue_rx_tx"
 _POWER = "powers and phases are not used"
+_MORE_PATHS = "times of additional paths are not used; angles of several paths are, as MultipleULAoA"
 
 
 def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, str] | None = None) -> Adapted:
@@ -109,8 +112,10 @@ class _Converter:
                 yield path, _NO_AZIMUTH
             case "uL-RTOA":
                 yield path, self._arrival(value.time, timing)
+                yield from _additional_paths(path, value)
             case "gNB-RxTxTimeDiff":
                 yield from ((path, outcome) for outcome in self._ranges(value.time, timing))
+                yield from _additional_paths(path, value)
             case _:
                 yield path, _POWER
 
@@ -180,6 +185,13 @@ class _Converter:
         if quality is None:
             return self.document.time_stdev_m**2 + measured.variance
         return (_steps(quality.value) * _RESOLUTION_M[quality.resolution]) ** 2 + measured.variance
+
+
+def _additional_paths(path: Path, value: UlRtoa | GnbRxTx) -> Iterator[tuple[Path, str]]:
+    if value.additional_paths is not None:
+        yield (*path, "additionalPathList"), _MORE_PATHS
+    if value.more_paths is not None:
+        yield (*path, "ExtendedAdditionalPathList"), _MORE_PATHS
 
 
 def _steps(quality: int) -> float:
