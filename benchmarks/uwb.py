@@ -7,7 +7,6 @@ drawn at random, as a blocked path would.
 
 import argparse
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -22,7 +21,7 @@ from rayfix.evaluation.calibration import ellipsoid_holds
 from rayfix.evaluation.uwb import ANCHORS, Ranging, least_squares, read_ranging, site_text
 from rayfix_offline.build import build_table
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import Fix, Range, Report
+from rayfix_service.fusion.report import Fix, Height, Range, Report
 from rayfix_tables.table import Table
 
 Array = NDArray[np.float64]
@@ -30,6 +29,8 @@ Array = NDArray[np.float64]
 ROOM = ((-4.5, -4.0, 0.0), (4.5, 4.0, 3.0))  # m
 CALIBRATION, HELD_OUT = (0.0, 0.25), (0.3, 1.0)  # shares of the run
 DETOUR = 3.0  # m
+HEIGHT_STDEV = 0.02  # m, where the height is known
+VARIANTS = (("", "sound"), (", one wrong", "spoilt"))
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "uwb"
 
 
@@ -49,35 +50,34 @@ def main() -> None:
     print(
         f"{len(ranging)} moments; bias of the anchors {np.array2string(bias, precision=2)} m, deviation {stdev:.3f} m"
     )
-    samples = take(rest, bias, options.reports, options.seed)
-    print("                                 horizontal error [m]        error [m]     in the ellipsoid of     fix")
-    print("                                 50 %   90 %   99 %    RMS   50 %   90 %   50 %    90 %    99 %    [ms]")
+    samples = take(rest, options.reports, options.seed)
+    print(f"{'':42}horizontal error [m]        error [m]     in the ellipsoid of     fix")
+    print(f"{'':42}50 %   90 %   99 %    RMS   50 %   90 %   50 %    90 %    99 %    [ms]")
     found: dict[str, Array] = {}
+
+    def show(label: str, places: list[Array], more: str = "") -> None:
+        found[label] = np.array([place - sample.truth for place, sample in zip(places, samples, strict=True)])
+        print(f"{label:39} {columns(found[label])}{more}", flush=True)
+
     for label, known in (("least squares", None), ("same, height known", height)):
-        for name, ranges in (("", "sound"), (", one wrong", "spoilt")):
-            places = [least_squares(ANCHORS[s.heard], getattr(s, ranges)[s.heard], height=known) for s in samples]
-            found[label + name] = errors(samples, places)
-            print(f"{label + name:30} {columns(found[label + name])}", flush=True)
+        for name, ranges in VARIANTS:
+            places = [
+                least_squares(ANCHORS[s.heard], (getattr(s, ranges) - bias)[s.heard], height=known) for s in samples
+            ]
+            show(label + name, places)
     with tempfile.TemporaryDirectory() as folder:
         for window in options.windows:
-            locator = Locator(anchor_table(Path(folder), window))
+            locator = Locator(anchor_table(Path(folder), bias, window))
             locator.warm_up()
-            for name, ranges in (("", "sound"), (", one wrong", "spoilt")):
-                label = f"rayfix {window:g} deg{name}"
-                fixes, seconds = locate(locator, samples, lambda s, ranges=ranges: getattr(s, ranges), stdev)
-                places = [np.full(3, np.inf) if fix.position is None else fix.position for fix in fixes]
-                found[label] = errors(samples, places)
-                inside = [
-                    np.mean(
-                        [
-                            bool(fix.candidates) and ellipsoid_holds(fix, p, s.truth)
-                            for fix, s in zip(fixes, samples, strict=True)
-                        ]
-                    )
-                    for p in (0.5, 0.9, 0.99)
-                ]
-                shares = "  ".join(f"{share:6.0%}" for share in inside)
-                print(f"{label:30} {columns(found[label])} {shares} {1e3 * seconds:8.1f}", flush=True)
+            prior = Height(z=height, stdev=HEIGHT_STDEV)
+            table = f"rayfix {window:g} deg"
+            for label, known_height in ((table, None), (f"{table}, height known", prior)):
+                for name, ranges in VARIANTS:
+                    fixes, seconds = locate(locator, samples, ranges, stdev, known_height)
+                    places = [np.full(3, np.inf) if fix.position is None else fix.position for fix in fixes]
+                    inside = [held(fixes, samples, probability) for probability in (0.5, 0.9, 0.99)]
+                    shares = "  ".join(f"{share:6.0%}" for share in inside)
+                    show(label + name, places, f" {shares} {1e3 * seconds:8.1f}")
     if options.plot is not None:
         last = f"rayfix {options.windows[-1]:g} deg"
         draw(options.plot, samples, found, last)
@@ -85,7 +85,7 @@ def main() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """Ranges of one tag at one moment, bias taken off; those of anchors that did not hear are NaN.
+    """Ranges of one tag at one moment, with their bias; those of anchors that did not hear are NaN.
 
     Attributes
     ----------
@@ -101,13 +101,13 @@ class Sample:
     truth: Array
 
 
-def take(ranging: Ranging, bias: Array, count: int, seed: int) -> list[Sample]:
+def take(ranging: Ranging, count: int, seed: int) -> list[Sample]:
     """Take evenly spaced moments, all tags of each."""
     rng = np.random.default_rng(seed)
     samples = []
     for n in np.linspace(0, len(ranging) - 1, count).astype(int):
         for tag in range(ranging.measured.shape[2]):
-            sound = ranging.measured[n, :, tag] - bias
+            sound = ranging.measured[n, :, tag]
             heard = np.isfinite(sound)
             spoilt = sound.copy()
             spoilt[rng.choice(np.flatnonzero(heard))] += DETOUR
@@ -115,29 +115,30 @@ def take(ranging: Ranging, bias: Array, count: int, seed: int) -> list[Sample]:
     return samples
 
 
-def anchor_table(folder: Path, window: float) -> Table:
+def anchor_table(folder: Path, bias: Array, window: float) -> Table:
     """Build the table of the anchors in their empty room."""
     room = trimesh.creation.box(bounds=ROOM)
     room.invert()
     (folder / "room.glb").write_bytes(trimesh.Scene(room).export(file_type="glb"))
     site = folder / f"site_{window:g}.toml"
-    site.write_text(site_text("room.glb", window_deg=window), encoding="utf-8")
+    site.write_text(site_text("room.glb", bias, window_deg=window), encoding="utf-8")
     build_table(site, site.with_suffix(".h5"))
     return Table.open(site.with_suffix(".h5"))
 
 
 def locate(
-    locator: Locator, samples: list[Sample], ranges_of: Callable[[Sample], Array], stdev: float
+    locator: Locator, samples: list[Sample], ranges: str, stdev: float, height: Height | None
 ) -> tuple[list[Fix], float]:
-    """Locate all samples; with the fixes comes the median of their seconds."""
+    """Locate all samples by one kind of their ranges; with the fixes comes the median of their seconds."""
     fixes, seconds = [], []
     for sample in samples:
-        ranges = ranges_of(sample)
+        lengths = getattr(sample, ranges)
         report = Report(
             measurements=tuple(
-                Range(station_id=f"a{n}", path_length=float(ranges[n]), stdev=stdev)
+                Range(station_id=f"a{n}", path_length=float(lengths[n]), stdev=stdev)
                 for n in np.flatnonzero(sample.heard)
-            )
+            ),
+            height=height,
         )
         begin = perf_counter()
         fixes.append(locator.locate(report))
@@ -145,9 +146,13 @@ def locate(
     return fixes, float(np.median(seconds))
 
 
-def errors(samples: list[Sample], places: list[Array]) -> Array:
-    """Places less the truth, shape (n_samples, 3), m."""
-    return np.array([place - sample.truth for place, sample in zip(places, samples, strict=True)])
+def held(fixes: list[Fix], samples: list[Sample], probability: float) -> float:
+    """Share of the fixes whose credible ellipsoid holds the truth."""
+    inside = [
+        bool(fix.candidates) and ellipsoid_holds(fix, probability, sample.truth)
+        for fix, sample in zip(fixes, samples, strict=True)
+    ]
+    return float(np.mean(inside))
 
 
 def columns(apart: Array) -> str:

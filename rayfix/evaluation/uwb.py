@@ -123,10 +123,17 @@ def least_squares(
     return np.asarray(x)
 
 
-def site_text(scene: str, *, window_deg: float) -> str:
-    """Site file of the anchors in a scene file, without reflections."""
+def site_text(scene: str, bias: NDArray[np.float64], *, window_deg: float) -> str:
+    """Site file of the anchors in a scene file, without reflections.
+
+    Parameters
+    ----------
+    bias : ndarray of shape (n_anchors,), m
+        Of each anchor's ranges.
+    """
     stations = "".join(
-        f'[[stations]]\nid = "a{n}"\nposition_m = [{x:g}, {y:g}, {z:g}]\n' for n, (x, y, z) in enumerate(ANCHORS)
+        f'[[stations]]\nid = "a{n}"\nposition_m = [{x:g}, {y:g}, {z:g}]\nbias = {{ range_m = {bias[n]:.4f} }}\n'
+        for n, (x, y, z) in enumerate(ANCHORS)
     )
     return (
         f'[site]\nname = "uwb"\nscene = "{scene}"\n'

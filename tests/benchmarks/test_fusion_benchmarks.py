@@ -66,7 +66,7 @@ def test_uwb(
     picture = tmp_path / "uwb.png"
     arguments = ["--data", str(shared_data / "uwb"), "--reports", "3", "--windows", "15", "--plot", str(picture)]
     lines = run("uwb.py", capsys, monkeypatch, *arguments)
-    rows = {line[:30].strip(): [float(v) for v in line[30:].split()[:6]] for line in lines[3:]}
+    rows = {line[:39].strip(): [float(v) for v in line[39:].split()[:6]] for line in lines[3:]}
     assert list(rows) == [
         "least squares",
         "least squares, one wrong",
@@ -74,6 +74,8 @@ def test_uwb(
         "same, height known, one wrong",
         "rayfix 15 deg",
         "rayfix 15 deg, one wrong",
+        "rayfix 15 deg, height known",
+        "rayfix 15 deg, height known, one wrong",
     ]
     # Median horizontal errors of nine fixes; one range of eight is 3 m too long.
     assert rows["rayfix 15 deg, one wrong"][0] < 0.5 * rows["least squares, one wrong"][0]

@@ -94,9 +94,10 @@ def test_least_squares_has_the_least_squares() -> None:
 
 
 def test_the_site_has_all_anchors(tmp_path: Path) -> None:
-    (tmp_path / "site.toml").write_text(site_text("room.glb", window_deg=8.0), encoding="utf-8")
+    (tmp_path / "site.toml").write_text(site_text("room.glb", np.arange(8) / 10.0, window_deg=8.0), encoding="utf-8")
     site = read_site(tmp_path / "site.toml")
     np.testing.assert_allclose([s.position_m for s in site.stations], ANCHORS, rtol=0, atol=1e-4)
+    np.testing.assert_allclose([s.bias.range_m for s in site.stations], np.arange(8) / 10.0, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow
