@@ -66,7 +66,7 @@ class Scene:
         """Corners of the triangles, shape (n_faces, 3, 3), m."""
         return self.vertices[self.faces]
 
-    @property
+    @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Low and high corner, shape (2, 3), m."""
         used = self.vertices[np.unique(self.faces)]
