@@ -78,6 +78,7 @@ def merge_coplanar(triangles: NDArray[np.float64], *, tolerance: float = TOLERAN
     links = np.concatenate([pairs, np.stack([inverse[:count], inverse[count:]], axis=1)])
     labels = connect(links, len(rounded))
     _, first, face_planes = np.unique(labels[inverse[:count]], return_index=True, return_inverse=True)
+    first, face_planes = _unchained(features, first, face_planes, tolerance)
 
     # The mean over the plane's area: all rays of one reflection sequence then share one exact mirror image.
     signs = np.sign(np.einsum("ij,ij->i", normals, normals[first][face_planes]))
@@ -93,3 +94,22 @@ def merge_coplanar(triangles: NDArray[np.float64], *, tolerance: float = TOLERAN
         face_planes=face_planes.astype(np.int32),
         surfaces=np.arange(len(first), dtype=np.int32),
     )
+
+
+def _unchained(
+    features: NDArray[np.float64], first: NDArray[np.int64], face_planes: NDArray[np.int64], tolerance: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Part planes that hang together only in a chain, each a little off the one before; the others stay as they are."""
+    signs = np.sign(np.einsum("ij,ij->i", features[:, :3], features[first[face_planes], :3]))
+    aligned = features * signs[:, None]
+    order = np.argsort(face_planes, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(face_planes))[:-1]])
+    low = np.minimum.reduceat(aligned[order], starts)
+    high = np.maximum.reduceat(aligned[order], starts)
+    chained = (high - low).max(axis=1) > 2.0 * tolerance
+    if not chained.any():
+        return first, face_planes
+    links = np.where(chained[face_planes, None], np.floor((aligned - low[face_planes]) / tolerance), 0.0)
+    keys = np.concatenate([face_planes[:, None], links], axis=1)
+    _, first, face_planes = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    return first, face_planes.reshape(-1)

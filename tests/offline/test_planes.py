@@ -96,6 +96,18 @@ def test_tilted_planes(tilt_deg: float, count: int) -> None:
     assert len(merge_coplanar(np.concatenate([floor, tilted]))) == count
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_stack_of_sheets_is_no_mirror(turned: bool) -> None:
+    """Two hundred sheets half a millimetre apart: each is coplanar with the next, the first is not with the last."""
+    sheets = [square(0, 0, 0.0005 * n, size=20.0) for n in range(200)]
+    if turned:
+        sheets = [sheet[:, ::-1] if n % 3 else sheet for n, sheet in enumerate(sheets)]
+    triangles = np.concatenate([*sheets, square(0, 0, 5.0, size=20.0)])
+    planes = merge_coplanar(triangles)
+    assert_on_planes(triangles, planes, atol=TOLERANCE)
+    assert 100 <= len(planes) <= 201
+
+
 def test_merged_planes_are_their_mean_by_area() -> None:
     """Three quarters of the area lie at 0 mm, one quarter at 0.8 mm."""
     triangles = np.concatenate([square(0, 0), square(1, 0), square(2, 0), square(3, 0, 0.0008)])
