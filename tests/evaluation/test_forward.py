@@ -644,3 +644,15 @@ def test_arguments_that_cannot_be_used() -> None:
         solver_of(floor).paths((0, 0, 1), (0, np.inf, 1))
     with pytest.raises(ValueError, match="the station is"):
         solver_of(floor).line_of_sight((0, 0), [(0, 0, 1)])
+
+
+def test_one_path_is_left_whole() -> None:
+    solver = solver_of(box((0, 0, 0), (4, 5, 3)), max_reflections=1)
+    paths = solver.paths((0.5, 0.6, 2.6), (1.6, 3.4, 1.1))
+    assert len(paths) == 7  # the direct one and one for each side of the box
+    for index in range(7):
+        one = paths.only(index)
+        assert len(one) == 1
+        assert one.path_length[0] == paths.path_length[index]
+        assert one.gain_db[0] == paths.gain_db[index]
+        np.testing.assert_array_equal(one.vertices[0], paths.vertices[index])

@@ -1,6 +1,5 @@
 """A report located by the paper's method as it would run online: launch, select, fit, multiply, arg max."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,11 +8,9 @@ from numpy.typing import NDArray
 from rayfix.evaluation.paper.algorithms import PaperSettings, algorithm_1, algorithm_2
 from rayfix.evaluation.paper.mixtures import Mixture, arg_max, multiply
 from rayfix.evaluation.paper.points import Launcher, RayPoints, draw_directions, points_on_rays
-from rayfix.evaluation.paper.selection import RelativeLength
-from rayfix_service.fusion.directions import to_scene
+from rayfix.evaluation.paper.reports import sort_for_paper
 from rayfix_service.fusion.lookup import NO_DIRECTION, Direction
-from rayfix_service.fusion.report import Angle, Range, Report, TimeDifference, TimeOfArrival
-from rayfix_tables.errors import ReportError
+from rayfix_service.fusion.report import Report
 from rayfix_tables.site import SiteInfo
 from rayfix_tables.table import Table
 
@@ -45,7 +42,7 @@ class PaperLocator:
         Raises
         ------
         ReportError
-            When the time differences do not share one reference, or a measurement is not the paper's.
+            When the paper's method does not know what is in the report.
         """
         mixtures = self.mixtures(report, rng)
         if not mixtures:
@@ -55,8 +52,10 @@ class PaperLocator:
 
     def mixtures(self, report: Report, rng: np.random.Generator) -> list[Mixture]:
         """Mixture over the position that each station's measurements give."""
-        directions, ranges, (reference, differences) = _sorted(report, self.site)
-        names = list(dict.fromkeys([*directions, *ranges, *([reference] if reference else []), *differences]))
+        sorted_report = sort_for_paper(report, self.site)
+        directions, ranges = sorted_report.directions, sorted_report.ranges
+        reference, differences = sorted_report.reference, sorted_report.differences
+        names = sorted_report.names
         points = {name: self._points(name, directions.get(name, NO_DIRECTION), rng) for name in names}
         found: list[Mixture] = []
         related: list[str] = [reference, *differences] if reference is not None else []
@@ -81,43 +80,3 @@ class PaperLocator:
         (station,) = [s for s in self.site.stations if s.id == name]
         directions = draw_directions(measured, count, rng)
         return points_on_rays(self.launcher, np.array(station.position), directions, step=settings.step, rng=rng)
-
-
-def _sorted(
-    report: Report, site: SiteInfo
-) -> tuple[dict[str, Direction], dict[str, tuple[float, float]], tuple[str | None, Mapping[str, RelativeLength]]]:
-    """Directions, ranges and relative lengths of a report by station; the last with their reference."""
-    stations = {station.id: station for station in site.stations}
-    directions: dict[str, Direction] = {}
-    ranges: dict[str, tuple[float, float]] = {}
-    arrivals: dict[str, tuple[float, float]] = {}
-    differences: dict[str, RelativeLength] = {}
-    references: set[str] = set()
-    for measurement in report.measurements:
-        name = measurement.station_id
-        if isinstance(measurement, Angle):
-            directions[name] = to_scene(measurement, stations[name], site.north)
-            if directions[name].tilt is not None:
-                raise ReportError("the paper's method knows no azimuth in a tilted frame", path=("measurements",))
-        elif isinstance(measurement, Range):
-            ranges[name] = (measurement.path_length, measurement.stdev)
-        elif isinstance(measurement, TimeOfArrival):
-            arrivals[name] = (measurement.path_length, measurement.stdev)
-        elif isinstance(measurement, TimeDifference):
-            references.add(measurement.reference_station_id)
-            differences[name] = RelativeLength(length_difference=measurement.length_difference, stdev=measurement.stdev)
-        else:
-            raise ReportError(f"the paper's method knows no {type(measurement).__name__}", path=("measurements",))
-    if len(arrivals) > 1:
-        first, (start, start_stdev) = next(iter(arrivals.items()))
-        references.add(first)
-        for name, (length, stdev) in arrivals.items():
-            if name != first:
-                both = float(np.hypot(stdev, start_stdev))
-                differences[name] = RelativeLength(length_difference=length - start, stdev=both)
-    if len(references) > 1:
-        raise ReportError(
-            f"the paper's method takes time differences to one reference, not to {', '.join(sorted(references))}",
-            path=("measurements",),
-        )
-    return directions, ranges, (next(iter(references), None), differences)

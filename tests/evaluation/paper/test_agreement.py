@@ -21,7 +21,6 @@ from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.report import Angle, Measurement, Range, Report, TimeDifference
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.angles import angles_of
-from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
 
 Array = NDArray[np.float64]
@@ -178,14 +177,3 @@ def test_nothing_agrees_and_nothing_is_found(room_table: Table) -> None:
     locator = PaperLocator.of_table(room_table)
     far = Range(station_id="a", path_length=500.0, stdev=0.5)
     assert locator.locate(Report(measurements=(far,)), np.random.default_rng(1)) is None
-
-
-@pytest.mark.slow
-def test_two_references_are_refused(room_table: Table) -> None:
-    locator = PaperLocator.of_table(room_table)
-    chain = tuple(
-        TimeDifference(station_id=n, reference_station_id=r, length_difference=0.1, stdev=0.3)
-        for n, r in [("b", "a"), ("c", "b")]
-    )
-    with pytest.raises(ReportError, match="to one reference, not to a, b"):
-        locator.locate(Report(measurements=chain), np.random.default_rng(1))
