@@ -32,6 +32,8 @@ path_prior_exponent = 2.0     # how much the strong ones are preferred
 windows_deg = [{windows}]
 fit = "tubes"                 # "tubes" (fast) or "em" (the paper's)
 seed = 1
+
+# A station's bias is what it measures wrongly each time (measured minus true) and how well that is known.
 {stations}"""
 
 _STATION = """
@@ -40,6 +42,7 @@ id = "{id}"
 position_m = [{position}]
 orientation_deg = [{bearing:g}, 0, 0]  # bearing, downtilt, slant; for angles in frame "lcs"
 field_of_view_deg = 360
+bias = {{ range_m = 0.0, range_stdev_m = 0.0, azimuth_deg = 0.0, zenith_deg = 0.0, angle_stdev_deg = 0.0 }}
 """
 
 

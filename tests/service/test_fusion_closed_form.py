@@ -592,6 +592,33 @@ def test_two_propagation_times_of_a_path_are_their_mean(make_table: MakeTable) -
     np.testing.assert_allclose(fix.candidates[0].covariance, expected.candidates[0].covariance, rtol=1e-9)
 
 
+def test_paths_of_one_station_are_as_of_stations_in_one_place(make_table: MakeTable) -> None:
+    """Two angles and two ranges of a station, against one of each at either of two stations that hear the same."""
+    mirrored = line_of_sight("a", UE + np.array([-7.0, 3.0, 0.0]), log_mass=0.4)
+    # The signal that seems to come from there is the UE's.
+    mirrored = replace(mirrored, x_mean=UE + np.array([0.2, -0.1, 0.05]))
+    stations = {
+        "a": Station(id="a", position=POSITIONS["a"]),
+        "twin": Station(id="twin", position=POSITIONS["a"]),
+    }
+    tubes = [TUBES[0], mirrored]
+    both = [*tubes, *(replace(tube, station_id="twin") for tube in tubes)]
+    locator = Locator(make_table(*both, stations=stations), EXACT)
+    paths = [
+        (angle_of(tube), Range(station_id="a", path_length=float(tube.u_mean[0]) + 0.2, stdev=0.4)) for tube in tubes
+    ]
+    one = locator.locate(report_of([m for path in paths for m in path]))
+    split = [replace(m, station_id="twin") for m in paths[1]]
+    two = locator.locate(report_of([*paths[0], *split]))
+    assert one.log_evidence == pytest.approx(two.log_evidence, abs=1e-9)
+    np.testing.assert_allclose(one.candidates[0].position, two.candidates[0].position, rtol=0, atol=1e-9)  # m
+    np.testing.assert_allclose(one.candidates[0].covariance, two.candidates[0].covariance, rtol=1e-9)
+    for mine, other in zip(one.outcomes, two.outcomes, strict=True):
+        assert mine.outlier_probability == pytest.approx(other.outlier_probability, abs=1e-9)
+    alone = locator.locate(report_of(paths[0]))
+    assert np.trace(one.candidates[0].covariance) < 0.9 * np.trace(alone.candidates[0].covariance)
+
+
 def test_two_symmetric_rooms_are_ambiguous(make_table: MakeTable) -> None:
     """One station, a mirror behind it: what it hears from either side looks the same."""
     left = right = line_of_sight("a", length_stdev=0.3, log_mass=12.0)
