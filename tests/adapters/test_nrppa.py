@@ -146,6 +146,15 @@ def test_several_angles_of_one_trp_are_several_measurements():
     assert "without an azimuth" in skipped.reason
 
 
+def test_paths_of_one_quantised_angle_count_once():
+    choices = [{"uL-AoA": aoa(100, 900)}, {"uL-AoA": aoa(200, 920)}, {"uL-AoA": aoa(100, 900)}]
+    adapted = parse_nrppa(message(item({"MultipleULAoA": {"multipleULAoA": choices}}), stations={"7": "bs3"}))
+    assert len(adapted.report.measurements) == 2
+    (skipped,) = adapted.skipped
+    assert skipped.path[-2:] == (2, "uL-AoA")
+    assert "says the same as" in skipped.reason
+
+
 @pytest.mark.parametrize(
     ("choice", "middle_tc", "step_tc"),
     [

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import ValidationError
 
-from rayfix_service.fusion.report import Height, Measurement, Report
+from rayfix_service.fusion.report import Angle, Height, Measurement, Report, TimeOfArrival
 from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportError
 from rayfix_service.wire.documents import HeightDocument
 from rayfix_service.wire.problems import Path, path_text
@@ -56,6 +56,8 @@ def adapted_report(
 ) -> Adapted:
     """Put measurements and what was left out together.
 
+    Quantised as other systems' are, an angle or an arrival may well come twice; it is then counted once.
+
     Raises
     ------
     InvalidReportError
@@ -71,12 +73,19 @@ def adapted_report(
     if len(measurements) > MAX_MEASUREMENTS:
         text = f"the message has {len(measurements)} measurements; give at most {MAX_MEASUREMENTS} at once"
         raise InvalidReportError((FieldProblem(path=(), message=text),))
+    first: dict[Measurement, Path] = {}
+    kept: list[tuple[Path, Measurement]] = []
+    repeated: list[Skipped] = []
+    for path, measurement in measurements:
+        if isinstance(measurement, Angle | TimeOfArrival) and measurement in first:
+            repeated.append(Skipped(path=path, reason=f"says the same as {path_text(first[measurement])}"))
+            continue
+        first.setdefault(measurement, path)
+        kept.append((path, measurement))
     return Adapted(
-        report=Report(
-            measurements=tuple(m for _, m in measurements), height=height, target_id=target_id, timestamp=timestamp
-        ),
-        sources=tuple(path for path, _ in measurements),
-        skipped=tuple(skipped),
+        report=Report(measurements=tuple(m for _, m in kept), height=height, target_id=target_id, timestamp=timestamp),
+        sources=tuple(path for path, _ in kept),
+        skipped=(*skipped, *repeated),
     )
 
 
@@ -97,7 +106,9 @@ def error_in_message(error: ReportError, adapted: Adapted) -> InvalidReportError
     source: Path = ()
     if len(error.path) > 1 and error.path[0] == "measurements" and isinstance(error.path[1], int):
         source = adapted.sources[error.path[1]]
-    text = f"{path_text(source)}: {error}; say with stations which one is meant" if source else str(error)
+    unknown = bool(error.path) and error.path[-1] in ("station_id", "reference_station_id")
+    remedy = "; say with stations which one is meant" if unknown else ""
+    text = f"{path_text(source)}: {error}{remedy}" if source else str(error)
     return InvalidReportError((FieldProblem(path=source, message=text),))
 
 
