@@ -26,7 +26,7 @@ POLL = 0.005
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--full", action="store_true", help="the hall's real windows instead of 10 and 20 deg")
+    parser.add_argument("--windows", type=float, nargs="+", default=[5.0, 15.0], metavar="DEG", help="default: 5 15")
     parser.add_argument("--jobs", type=int, default=-1, help="cells fitted at a time (default: one per core)")
     parser.add_argument("--minutes", type=float, default=60.0, help="kill no further build after that (default 60)")
     parser.add_argument("--seed", type=int, default=1)
@@ -35,7 +35,7 @@ def main() -> None:
     rng = random.Random(options.seed)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        site = write_example(folder, windows_deg=(1.25, 5.0, 15.0) if options.full else (10.0, 20.0))
+        site = write_example(folder, windows_deg=tuple(options.windows))
         whole = folder / "whole.h5"
         finish(start(site, whole, options.jobs))
         expected = Table.open(whole).table_id

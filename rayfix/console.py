@@ -1,5 +1,6 @@
 """What the command line shows: progress bars, summaries, tables and fixes."""
 
+import resource
 import textwrap
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -11,12 +12,15 @@ from rich.console import Console
 from rich.progress import (
     BarColumn,
     Progress,
+    ProgressColumn,
+    Task,
     TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 from rich.table import Table as Grid
+from rich.text import Text
 
 from rayfix_tables.table import Table
 from rayfix_tables.update import Update
@@ -29,17 +33,19 @@ if TYPE_CHECKING:
 
 @contextmanager
 def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
-    """Show a progress bar with the remaining time on standard error."""
+    """Show stage, rate, time that is left and memory on standard error."""
     if not enabled:
         yield None
         return
     bar = Progress(
-        TextColumn("{task.description:<24}"),
-        BarColumn(bar_width=20),
+        TextColumn("{task.description:<20}"),
+        BarColumn(bar_width=12),
         TaskProgressColumn(),
+        _RateColumn(),
         TimeElapsedColumn(),
-        TextColumn("remaining"),
+        TextColumn("left"),
         TimeRemainingColumn(),
+        _MemoryColumn(),
         console=Console(stderr=True),
     )
     task = bar.add_task("starting", total=None)
@@ -54,6 +60,20 @@ def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
         yield show
     finally:
         bar.stop()
+
+
+class _RateColumn(ProgressColumn):
+    """Cells that are done in a second."""
+
+    def render(self, task: Task) -> Text:
+        return Text(f"{task.speed:,.0f} cells/s" if task.speed else "", justify="right")
+
+
+class _MemoryColumn(ProgressColumn):
+    """Most memory that the process has held."""
+
+    def render(self, task: Task) -> Text:
+        return Text(f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9:.1f} GB")
 
 
 def print_check(check: "Check") -> None:
@@ -81,7 +101,12 @@ def print_check(check: "Check") -> None:
 def print_build_summary(summary: "BuildSummary") -> None:
     """Print a line per station and one for the whole."""
     grid = Grid(
-        "station", title=f"Table {summary.path}", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1)
+        "station",
+        title=f"Table {summary.path}",
+        title_justify="left",
+        caption_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 0, 0, 1),
     )
     for heading in ("", "cells", "filled", "tubes", "MB", "lost"):
         grid.add_column(heading, justify="right")

@@ -35,15 +35,10 @@ def cell_changes(old: LevelRays, new: LevelRays) -> NDArray[np.float64]:
     -------
     ndarray of shape (n_cells,)
         Change of each cell's measure as a share of its new mass; 0 where nothing at all has changed, inf where no ray
-        comes any longer.
-
-    Raises
-    ------
-    ValueError
-        When the rays do not start in the same directions.
+        comes any longer, and everywhere if the rays do not start in the same directions.
     """
     if not np.array_equal(old.rays.directions, new.rays.directions):
-        raise ValueError("traces of different directions cannot be compared")
+        return np.full(new.grid.num_cells, np.inf)
     change, mass, same = ray_changes(old, new)
     rays = new.rays
     return np.asarray(

@@ -63,7 +63,7 @@ class FormerStation:
     site: SiteFile
     twin: Twin
 
-    def kept_cells(self, trace: StationTrace, tolerance: float) -> KeptCells:
+    def kept_cells(self, trace: StationTrace, tolerance: float, *, jobs: int = 1) -> KeptCells:
         """Find the cells that have changed no more than a tolerance.
 
         Parameters
@@ -72,8 +72,10 @@ class FormerStation:
             In the new scene.
         tolerance : float
             Largest change; with 0, only cells that are the same to the last bit.
+        jobs : int
+            Threads; -1 for one per core.
         """
-        former = trace_station(self.plan.section, self.site, self.twin)
+        former = trace_station(self.plan.section, self.site, self.twin, jobs=jobs)
         compared = cell_changes(former.finest, trace.finest)
         change = np.full(len(compared), np.inf)
         for block in self.plan.finest_blocks:

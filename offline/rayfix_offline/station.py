@@ -101,7 +101,7 @@ def build_station(plan: StationPlan, job: Job, remote: "Cluster | None", report:
             trace = trace_station(plan.section, job.site, job.twin, jobs=job.jobs)
             if former is not None:
                 report(f"{plan.station.id}: comparing", done)
-                kept, missing = _split(missing, former.kept_cells(trace, job.tolerance))
+                kept, missing = _split(missing, former.kept_cells(trace, job.tolerance, jobs=job.jobs))
             launch = trace.to_arrays()
             fitting = remote.fit_blocks(plan, missing) if remote else _fit_blocks(missing, trace, job)
         job.store.save(f"{name}-launch", launch)

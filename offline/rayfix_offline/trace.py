@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import Sequences, launch
+from rayfix_offline.launch import Segments, Sequences, launch
 from rayfix_offline.materials import Reflectivity, constant_reflectivity, itu_reflectivity
 from rayfix_offline.pathprior import fill_path_prior
 from rayfix_offline.pieces import Pieces, cut_pieces
@@ -27,6 +27,12 @@ SLICE_RATIO = 1.2
 
 PRIOR_REFINEMENT = 2
 """A voxel of the path prior is this many voxels of the free space wide."""
+
+PRIOR_RAYS = 0.7
+"""At the far end of the scene, the rays that fill the path prior lie this many of its voxels apart, or closer."""
+
+PRIOR_SPACING = 0.0073
+"""Rays that are launched for the path prior's sake need not lie closer than this, rad."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +85,12 @@ def level_grid(window: float) -> AngularGrid:
     return AngularGrid.from_spacing(window / CELLS_PER_WINDOW)
 
 
+def prior_spacing(twin: Twin) -> float:
+    """Largest spacing of the rays that fill a site's path prior, rad."""
+    far = float(np.linalg.norm(twin.scene.bounds[1] - twin.scene.bounds[0]))
+    return max(PRIOR_SPACING, PRIOR_RAYS * PRIOR_REFINEMENT * twin.free_space.voxel_size / far)
+
+
 def reflectivity_of(site: SiteFile, twin: Twin) -> Reflectivity:
     """Return what the triangles of a site's scene reflect."""
     propagation, scene = site.propagation, twin.scene
@@ -105,19 +117,15 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin, *, jobs: 
     window = float(np.deg2rad(site.table.windows_deg[0]))
     spacing = window / RAYS_PER_WINDOW
     name = int.from_bytes(hashlib.sha256(station.id.encode()).digest()[:8], "big")
-    rays = sample_rays(spacing, np.random.default_rng([site.table.seed, name]))
-    segments = launch(
-        np.array(station.position_m),
-        rays.directions,
-        engine=twin.engine,
-        planes=twin.planes,
-        reflectivity=reflectivity_of(site, twin),
-        bounds=twin.scene.bounds,
-        max_reflections=site.propagation.max_reflections,
-        max_path_length=site.propagation.max_path_length_m,
-    )
+    rays, segments = _launch(station, site, twin, spacing, np.random.default_rng([site.table.seed, name]))
+    prior_rays, prior_segments = rays, segments
+    if spacing > prior_spacing(twin):
+        rng = np.random.default_rng([site.table.seed, name, 1])
+        prior_rays, prior_segments = _launch(station, site, twin, prior_spacing(twin), rng)
     exponent = site.propagation.path_prior_exponent
-    prior = fill_path_prior(rays, segments, twin.free_space, exponent=exponent, refinement=PRIOR_REFINEMENT, jobs=jobs)
+    prior = fill_path_prior(
+        prior_rays, prior_segments, twin.free_space, exponent=exponent, refinement=PRIOR_REFINEMENT, jobs=jobs
+    )
     pieces = cut_pieces(
         rays,
         segments,
@@ -136,4 +144,22 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin, *, jobs: 
         sequences=segments.sequences,
         surface_sequences=surface_sequences(segments.sequences, twin.planes),
     )
-    return StationTrace(finest=finest, lost_ray_share=segments.lost_ray_share, coverage=prior.coverage)
+    return StationTrace(finest=finest, lost_ray_share=prior_segments.lost_ray_share, coverage=prior.coverage)
+
+
+def _launch(
+    station: StationSection, site: SiteFile, twin: Twin, spacing: float, rng: np.random.Generator
+) -> tuple[RaySet, Segments]:
+    """Launch a station's rays, this far apart [rad]."""
+    rays = sample_rays(spacing, rng)
+    segments = launch(
+        np.array(station.position_m),
+        rays.directions,
+        engine=twin.engine,
+        planes=twin.planes,
+        reflectivity=reflectivity_of(site, twin),
+        bounds=twin.scene.bounds,
+        max_reflections=site.propagation.max_reflections,
+        max_path_length=site.propagation.max_path_length_m,
+    )
+    return rays, segments

@@ -1,6 +1,7 @@
 """Write table files: beside the final name, checksummed, synced, then renamed into place."""
 
 import contextlib
+import glob
 import io
 import json
 import os
@@ -113,6 +114,7 @@ def write_table(
         When the disk is full or the folder cannot be written; no partial file is left.
     """
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
+    _remove_abandoned(path)
     try:
         with _Sink(partial, "w+") as sink:
             try:
@@ -135,6 +137,17 @@ def write_table(
         with contextlib.suppress(OSError):
             partial.unlink()
     return table_id
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Remove what processes that were killed have left half written."""
+    for partial in path.parent.glob(f".{glob.escape(path.name)}.partial-*"):
+        with contextlib.suppress(OSError, ValueError):
+            process = int(partial.name.rpartition("-")[2])
+            try:
+                os.kill(process, 0)
+            except ProcessLookupError:
+                partial.unlink()
 
 
 class _Sink(io.FileIO):

@@ -166,3 +166,14 @@ def test_rights_that_are_missing(tmp_path_factory: pytest.TempPathFactory, make_
         f"cannot write {path}: the folder {folder} is read-only; choose another",
         f"{path} cannot be read; ask its owner for the right to read it",
     ]
+
+
+def test_what_a_killed_process_left_is_removed(make_content: Callable[..., Any], tmp_path: Path) -> None:
+    gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    abandoned = tmp_path / f".t.h5.partial-{gone.stdout.strip()}"
+    # Another process is still at work, another table is none of ours, and who knows what the last is.
+    others = {f".t.h5.partial-{os.getppid()}", f".other.h5.partial-{gone.stdout.strip()}", ".t.h5.partial-new"}
+    for name in (abandoned.name, *others):
+        (tmp_path / name).touch()
+    make_content(1).write(tmp_path / "t.h5")
+    assert {entry.name for entry in tmp_path.iterdir()} == {"t.h5", *others}
