@@ -2,6 +2,8 @@
 
 import json
 import math
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -233,6 +235,29 @@ def test_other_timestamps_are_refused(timestamp: str):
     with pytest.raises(InvalidReportError, match="RFC 3339") as caught:
         parse_report({"timestamp": timestamp, "measurements": [PT]})
     assert caught.value.path == ("timestamp",)
+
+
+def documented() -> list[dict[str, Any]]:
+    """All whole JSON objects of docs/measurements.md."""
+    text = (Path(__file__).resolve().parents[2] / "docs" / "measurements.md").read_text(encoding="utf-8")
+    decoder, found = json.JSONDecoder(), []
+    for block in re.findall(r"```json\n(\{.*?)```", text, re.DOTALL):
+        rest = block.strip()
+        while rest:
+            document, end = decoder.raw_decode(rest)
+            found.append(document)
+            rest = rest[end:].strip()
+    return found
+
+
+def test_the_documented_measurements_are_taken():
+    kinds = set()
+    for document in documented():
+        report = document if "measurements" in document else {"measurements": [document]}
+        kinds |= {measurement["type"] for measurement in report["measurements"]}
+        assert parse_report(report).measurements
+    assert kinds == {"aoa", "pt", "toa", "tdoa", "rssi"}
+    assert len(documented()) == 9
 
 
 @pytest.mark.parametrize("example", [*REPORT_EXAMPLES.values()], ids=[*REPORT_EXAMPLES])
