@@ -133,7 +133,7 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
 
 
 def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: np.random.Generator) -> dict[str, float]:
-    """Time both fits on neighbouring cells, as blocks have them, window by window."""
+    """Time both fits, window by window."""
     component = sum(
         int(np.prod(shape, dtype=int)) * np.dtype(FIELD_DTYPES[name]).itemsize for name, shape in FIELD_SHAPES.items()
     )
@@ -142,9 +142,8 @@ def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: n
     print("fits:   window   tubes [cells/s]   em, K = 16 [cells/s]   ratio   components   bytes per cell, tubes")
     for level in (traced.finest,):
         name = f"{np.rad2deg(level.window):.2f} deg"
-        count = min(num_cells, level.grid.num_cells)
-        numbers = rng.integers(level.grid.num_cells - count + 1) + np.arange(count)
-        centres = level.grid.centres[numbers]
+        numbers = scattered_blocks(level.grid.num_cells, num_cells, rng)
+        count, centres = len(numbers), level.grid.centres[numbers]
         counts, _, _ = fit_tubes(centres, level, TubeFit())
         tubes = median_seconds(lambda lv=level, c=centres: fit_tubes(c, lv, TubeFit())) / count
         gather = median_seconds(lambda lv=level, c=centres: gather_cells(c, lv)) / count
@@ -159,10 +158,17 @@ def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: n
     return seconds
 
 
+def scattered_blocks(num_cells: int, most: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Choose cells from all over a level, in rows of 16 neighbours, which share rays as in a build."""
+    rows = np.arange(0, num_cells - 15, 16)
+    chosen = rng.permutation(len(rows))[: max(1, most // 16)]
+    return (np.sort(rows[chosen])[:, None] + np.arange(16)).reshape(-1)
+
+
 def gather_cells(centres: NDArray[np.float64], level: LevelRays) -> None:
     """Gather the groups of cells, and no more."""
     rays, pieces, sequences = level.rays, level.pieces, level.sequences
-    rows = new_rows(len(sequences.images))
+    num_slices, rows = pieces.num_slices, new_rows(len(sequences.images))
     for centre in centres:
         gather_groups(
             centre[0],
@@ -182,7 +188,7 @@ def gather_cells(centres: NDArray[np.float64], level: LevelRays) -> None:
             pieces.variance,
             sequences.images,
             sequences.mirrors,
-            pieces.num_slices,
+            num_slices,
             rows,
         )
 

@@ -72,10 +72,10 @@ def gather_groups(
     """
     keys = np.empty((64, 2), np.int64)
     sums = np.zeros((64, NUM_SUMS))
-    count = np.int64(0)  # a plain 0 would have _add_ray compiled once more, for a constant
+    count = np.int64(0)  # plain zeros would have _add_ray compiled once more, for constants
     # Groups by slice, for the sequences that the cell has: all of a station's would be too many to keep a place for.
-    slots = np.full((16, num_slices), -1, np.int32)
-    num_rows = 0
+    slots = np.full((64, num_slices), -1, np.int32)
+    num_rows = np.int64(0)
     sine = np.sin(centre_zenith)
     reach = CUTOFF * window
     num_rings = len(ring_cells)
@@ -103,13 +103,9 @@ def gather_groups(
             if count + last - first > len(sums):
                 capacity = 2 * (count + last - first)
                 keys, sums = _grown(keys, capacity, 0), _grown(sums, capacity, 0)
-            for piece in range(first, last):
-                if rows[piece_sequence[piece]] < 0 and density * piece_mass[piece] > 0.0:
-                    rows[piece_sequence[piece]] = num_rows
-                    num_rows += 1
-            if num_rows > len(slots):
-                slots = _grown(slots, 2 * num_rows, -1)
-            count = _add_ray(
+            if num_rows + last - first > len(slots):
+                slots = _grown(slots, 2 * (num_rows + last - first), -1)
+            count, num_rows = _add_ray(
                 density,
                 horizontal,
                 vertical,
@@ -124,6 +120,7 @@ def gather_groups(
                 keys,
                 sums,
                 count,
+                num_rows,
             )
 
     masses = np.empty(count)
@@ -152,8 +149,9 @@ def _add_ray(
     keys: Any,
     sums: Any,
     count: Any,
+    num_rows: Any,
 ) -> Any:
-    """Add a ray's pieces to the sums of their groups, and return the number of groups.
+    """Add a ray's pieces to the sums of their groups, and return the numbers of groups and of sequences.
 
     What is added is mass, mass x length and mass x length^2, times products of a and d. It is written out, so that
     the products stay in the processor's registers for all pieces of the ray: in loops it takes three times as long.
@@ -164,6 +162,10 @@ def _add_ray(
         if mass <= 0.0:
             continue
         row = rows[sequence[piece]]
+        if row < 0:
+            row = num_rows
+            num_rows += 1
+            rows[sequence[piece]] = row
         group = slots[row, slices[piece]]
         if group < 0:
             group = count
@@ -201,7 +203,7 @@ def _add_ray(
         sums[group, 25] += twice * (y * y)
         sums[group, 26] += twice * (y * z)
         sums[group, 27] += twice * (z * z)
-    return count
+    return count, num_rows
 
 
 @numba.njit(cache=True, nogil=True)

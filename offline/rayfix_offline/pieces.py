@@ -8,6 +8,7 @@ A piece is shared by all cells of all levels whose window the ray lies in.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numba
@@ -45,7 +46,7 @@ class Pieces:
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
 
-    @property
+    @cached_property
     def num_slices(self) -> int:
         """Number of slices that occur, counted from the station."""
         return int(self.slice.max(initial=-1)) + 1

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rayfix_offline.launch import Segments, Sequences
-from rayfix_offline.pathprior import PathPrior
+from rayfix_offline.pathprior import PathPrior, fill_path_prior
 from rayfix_offline.pieces import FIRST_NODE, Pieces, cut_pieces
 from rayfix_offline.rays import RaySet, sample_rays
+from rayfix_tables.freespace import FreeSpace
 
 Launch = Callable[..., Segments]
 Kind = Literal["power", "uniform", "paper"]
@@ -194,3 +195,17 @@ def test_chosen_rays_keep_their_pieces(rays: RaySet, segments: Segments) -> None
     assert chosen.offsets[-1] == len(chosen.mass)
     none = pieces.of_rays(np.zeros(0, np.int64))
     assert (none.offsets.tolist(), len(none.mass)) == ([0], 0)
+
+
+def test_the_number_of_threads_changes_nothing(rays: RaySet, segments: Segments) -> None:
+    """Neither the map nor the pieces, to the last bit."""
+    space = FreeSpace(origin=np.zeros(3), voxel_size=0.25, free=np.ones((16, 20, 12), bool))
+    priors = [fill_path_prior(rays, segments, space, exponent=2.0, refinement=2, jobs=jobs) for jobs in (1, 2)]
+    np.testing.assert_array_equal(priors[0].total, priors[1].total)
+    assert priors[0].coverage == priors[1].coverage
+    one, two = (
+        cut_pieces(rays, segments, priors[0], exponent=2.0, kind="power", slice_ratio=RATIO, jobs=jobs)
+        for jobs in (1, 2)
+    )
+    for name in ("offsets", "sequence", "slice", "mass", "mean", "variance"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
