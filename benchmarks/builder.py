@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from rayfix.example.files import write_example
 from rayfix_offline import trace
+from rayfix_offline.cells import assemble_level, fit_cells, widen_cells
 from rayfix_offline.em import ExpectationMaximisation, fit_em
 from rayfix_offline.engine import RayEngine
 from rayfix_offline.launch import Segments, launch
@@ -30,7 +31,7 @@ from rayfix_offline.pathprior import fill_path_prior
 from rayfix_offline.pieces import cut_pieces
 from rayfix_offline.rays import RaySet, sample_rays
 from rayfix_offline.site import SiteFile, read_site
-from rayfix_offline.trace import LevelRays, StationTrace, reflectivity_of, trace_station
+from rayfix_offline.trace import LevelRays, StationTrace, level_grid, reflectivity_of, trace_station
 from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_offline.twin import Twin, prepare_twin
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
@@ -52,7 +53,8 @@ def main() -> None:
         print(f"the bundled hall, {len(twin.scene.faces)} triangles; medians of {RUNS} runs on one thread")
         seconds = measure_rays(site, twin)
         traced = trace_station(site.stations[0], site, twin)
-        seconds |= measure_fits(traced, options.cells, options.em_cells, np.random.default_rng(options.seed))
+        gather = measure_fits(traced, options.cells, options.em_cells, np.random.default_rng(options.seed))
+        seconds |= measure_levels(traced, site, gather)
         print_stages(seconds)
         if options.build:
             measure_build(site_path)
@@ -132,29 +134,47 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
     }
 
 
-def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: np.random.Generator) -> dict[str, float]:
-    """Time both fits, window by window."""
+def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: np.random.Generator) -> float:
+    """Time both fits of the finest window, and return the seconds in which tubes' groups are gathered in all cells."""
+    level = traced.finest
     component = sum(
         int(np.prod(shape, dtype=int)) * np.dtype(FIELD_DTYPES[name]).itemsize for name, shape in FIELD_SHAPES.items()
     )
     em = ExpectationMaximisation(num_components=(16,))
-    seconds = {}
-    print("fits:   window   tubes [cells/s]   em, K = 16 [cells/s]   ratio   components   bytes per cell, tubes")
-    for level in (traced.finest,):
-        name = f"{np.rad2deg(level.window):.2f} deg"
-        numbers = scattered_blocks(level.grid.num_cells, num_cells, rng)
-        count, centres = len(numbers), level.grid.centres[numbers]
-        counts, _, _ = fit_tubes(centres, level, TubeFit())
-        tubes = median_seconds(lambda lv=level, c=centres: fit_tubes(c, lv, TubeFit())) / count
-        gather = median_seconds(lambda lv=level, c=centres: gather_cells(c, lv)) / count
-        some, chosen = centres[:num_em_cells], numbers[:num_em_cells]
-        slow = median_seconds(lambda lv=level, c=some, n=chosen: fit_em(c, n, lv, em)) / len(some)
-        print(
-            f"  {name:>12} {1.0 / tubes:15.0f} {1.0 / slow:22.1f} {slow / tubes:7.0f} "
-            f"{counts.mean():12.1f} {counts.mean() * component:14.0f}"
-        )
-        seconds[f"{name}: gather"] = gather * level.grid.num_cells
-        seconds[f"{name}: merge, the rest"] = (tubes - gather) * level.grid.num_cells
+    numbers = scattered_blocks(level.grid.num_cells, num_cells, rng)
+    centres = level.grid.centres[numbers]
+    counts, _, _ = fit_tubes(centres, level, TubeFit())
+    tubes = median_seconds(lambda: fit_tubes(centres, level, TubeFit())) / len(numbers)
+    some = rng.permutation(len(numbers))[:num_em_cells]
+    slow = median_seconds(lambda: fit_em(centres[some], numbers[some], level, em)) / len(some)
+    print(
+        f"fits of {np.rad2deg(level.window):g} deg cells:\n"
+        f"  tubes              {1.0 / tubes:6.0f} cells/s, {counts.mean():.1f} components, "
+        f"{counts.mean() * component:.0f} bytes per cell\n"
+        f"  em, 16 components  {1.0 / slow:6.1f} cells/s\n"
+        f"  tubes / em         {slow / tubes:6.0f}"
+    )
+    return median_seconds(lambda: gather_cells(centres, level)) / len(numbers) * level.grid.num_cells
+
+
+def measure_levels(traced: StationTrace, site: SiteFile, gather: float) -> dict[str, float]:
+    """Fit all cells of a station once, level by level."""
+    window = traced.finest.window
+    begin = time.thread_time()
+    parts = [
+        fit_cells(cells, traced.finest, site)
+        for cells in np.array_split(np.arange(traced.finest.grid.num_cells), traced.finest.grid.num_cells // 256)
+    ]
+    finer = assemble_level(window, traced.finest.grid, parts)
+    name = f"{np.rad2deg(window):g} deg"
+    seconds = {f"{name}: gather": gather, f"{name}: merge, the rest": time.thread_time() - begin - gather}
+    for window in np.deg2rad(site.table.windows_deg[1:]).tolist():
+        grid = level_grid(window)
+        widen_cells(np.arange(1), window, grid, finer, np.zeros(finer.grid.num_cells, np.float32))
+        begin = time.thread_time()
+        wide = widen_cells(np.arange(grid.num_cells), window, grid, finer, np.zeros(finer.grid.num_cells, np.float32))
+        seconds[f"{np.rad2deg(window):g} deg: sums of cells"] = time.thread_time() - begin
+        finer = assemble_level(window, grid, [wide])
     return seconds
 
 
@@ -194,7 +214,7 @@ def gather_cells(centres: NDArray[np.float64], level: LevelRays) -> None:
 
 
 def print_stages(seconds: dict[str, float]) -> None:
-    """Print what the stages of one station take, the fits of all its cells extrapolated from those measured."""
+    """Print what the stages of one station take."""
     total = sum(seconds.values())
     print(f"stages of one station, {total:.2f} s of one thread:")
     for name, value in seconds.items():
