@@ -60,7 +60,7 @@ def main() -> None:
             errors = columns(our_errors[: len(few)], 3), columns(their_errors, 3)
             ratio = np.median(theirs) / np.median(ours)
             rayfix_columns = f"{columns(1e3 * ours)} {errors[0]}"
-            paper_columns = f"{1e3 * np.median(theirs):9.0f}  {errors[1]}  {ratio:8.0f}"
+            paper_columns = f"{1e3 * np.median(theirs):9.0f}  {errors[1]}  {ratio:8.1f}"
             print(f"{label:12} {rayfix_columns}  {paper_columns}  {throughput(locator, reports)}", flush=True)
 
 
