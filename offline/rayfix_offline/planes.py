@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from rayfix_offline.topology import connect
+from rayfix_offline.topology import connect, number_rows
 
 TOLERANCE = 1e-3
 """Triangles whose planes differ by less than this over the whole scene are coplanar, m."""
@@ -72,7 +72,9 @@ def merge_coplanar(triangles: NDArray[np.float64], *, tolerance: float = TOLERAN
     both = np.concatenate([features, -features])
     # Rounded first: the pairs among thousands of triangles of one floor would be millions.
     step = ROUNDING * tolerance
-    rounded, inverse = np.unique(np.round(both / step), axis=0, return_inverse=True)
+    steps = np.round(both / step)
+    inverse = number_rows(steps)
+    rounded = steps[np.unique(inverse, return_index=True)[1]]
     pairs = cKDTree(rounded * step).query_pairs(tolerance, output_type="ndarray")
     count = len(triangles)
     links = np.concatenate([pairs, np.stack([inverse[:count], inverse[count:]], axis=1)])

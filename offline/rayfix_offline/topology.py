@@ -104,15 +104,30 @@ def connect(links: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
+def number_rows(rows: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Give rows numbers in lexicographic order, equal ones the same, as ``np.unique`` does with ``axis=0``.
+
+    It goes column by column, for sorting numbers takes a fraction of the time of sorting rows.
+
+    Parameters
+    ----------
+    rows : ndarray of shape (n, d)
+
+    Returns
+    -------
+    ndarray of int64, shape (n,)
+    """
+    number = np.zeros(len(rows), np.int64)
+    for column in rows.T:
+        _, place = np.unique(column, return_inverse=True)
+        _, number = np.unique(number * (int(place.max(initial=0)) + 1) + place.reshape(-1), return_inverse=True)
+        number = number.reshape(-1)
+    return number
+
+
 def find_topology(scene: Scene) -> Topology:
     """Weld the corners of a scene's triangles and find their edges."""
-    # Axis by axis, for sorting numbers takes a fraction of the time of sorting rows.
-    welded = np.zeros(len(scene.vertices), np.int64)
-    for axis in range(3):
-        _, place = np.unique(np.round(scene.vertices[:, axis] / WELD), return_inverse=True)
-        _, welded = np.unique(welded * (int(place.max()) + 1) + place.reshape(-1), return_inverse=True)
-        welded = welded.reshape(-1)
-    points = welded[scene.faces]
+    points = number_rows(np.round(scene.vertices / WELD))[scene.faces]
     ends = np.roll(points, -1, axis=1)
     keys = np.minimum(points, ends) * (int(points.max()) + 1) + np.maximum(points, ends)
     edges = np.unique(keys, return_inverse=True)[1].reshape(points.shape)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from rayfix_offline.planes import Planes, merge_coplanar
 from rayfix_offline.scene import Scene
 from rayfix_offline.surfaces import FACET_SIZE, SURFACE_ANGLE, join_facets
-from rayfix_offline.topology import find_topology
+from rayfix_offline.topology import find_topology, number_rows
 
 Triangles = NDArray[np.float64]
 Box = Callable[..., Triangles]
@@ -185,3 +185,11 @@ def test_motion_and_facing_change_nothing(seed: int) -> None:
     before, after = surfaces_of(triangles), surfaces_of(moved)
     pairs = set(zip(before.tolist(), after.tolist(), strict=True))
     assert len(pairs) == len(set(before.tolist())) == len(set(after.tolist()))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_rows_are_numbered_as_numpy_does(seed: int) -> None:
+    """Few values, so that rows repeat; zeros of both signs are one."""
+    rows = np.random.default_rng(seed).integers(-2, 3, (300, 4)) * -0.5
+    np.testing.assert_array_equal(number_rows(rows), np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1))
