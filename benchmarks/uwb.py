@@ -22,6 +22,7 @@ from rayfix.evaluation.uwb import ANCHORS, Ranging, least_squares, read_ranging,
 from rayfix_offline.build import build_table
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import Fix, Height, Range, Report
+from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.table import Table
 
 Array = NDArray[np.float64]
@@ -39,6 +40,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=FOLDER, help="folder of the data set")
     parser.add_argument("--reports", type=int, default=100, help="moments, evenly spaced; each has three tags")
     parser.add_argument("--windows", type=float, nargs="+", default=[8.0, 15.0], help="of the tables, deg")
+    parser.add_argument("--beam", type=int, default=FusionSettings().beam_width, help="hypotheses that are kept")
     parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--plot", type=Path, help="picture of the last window's fixes")
     options = parser.parse_args()
@@ -65,9 +67,10 @@ def main() -> None:
                 least_squares(ANCHORS[s.heard], (getattr(s, ranges) - bias)[s.heard], height=known) for s in samples
             ]
             show(label + name, places)
+    settings = FusionSettings(beam_width=options.beam)
     with tempfile.TemporaryDirectory() as folder:
         for window in options.windows:
-            locator = Locator(anchor_table(Path(folder), bias, window))
+            locator = Locator(anchor_table(Path(folder), bias, window), settings)
             locator.warm_up()
             prior = Height(z=height, stdev=HEIGHT_STDEV)
             table = f"rayfix {window:g} deg"
