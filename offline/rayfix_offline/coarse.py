@@ -16,9 +16,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.halving import halve_and_merge
 from rayfix_offline.moments import SIZE
 from rayfix_offline.tubes import joint_to_tubes
+from rayfix_tables.halving import halve_and_merge
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture
 
@@ -242,6 +242,12 @@ def _sum_cell(
                 cov[place, i, 1] *= stretch
             place += 1
     weight /= weight.sum()
-    alive = np.empty(total, np.bool_)
-    halve_and_merge(weight, mean, cov, label, _scale(weight, mean, noise), noise, max_divergence, alive)
+    # Of components that become one, the number of reflections of the heaviest stays.
+    heaviest = weight.copy()
+    scale, one_group = _scale(weight, mean, noise), np.zeros(total, np.int64)
+    into = halve_and_merge(weight, mean, cov, one_group, scale, noise, max_divergence)
+    for n in range(total):
+        if heaviest[n] > heaviest[into[n]]:
+            heaviest[into[n]], label[into[n]] = heaviest[n], label[n]
+    alive = into == np.arange(total)
     return top + np.log(mass), change / mass, weight[alive], mean[alive], cov[alive], label[alive]

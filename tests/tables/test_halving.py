@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rayfix_offline.halving import halve_and_merge
+from rayfix_tables.halving import halve_and_merge
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,7 +16,7 @@ class Mixture:
     weight: NDArray[np.float64]
     mean: NDArray[np.float64]
     cov: NDArray[np.float64]
-    label: NDArray[np.int8]
+    group: NDArray[np.int64]
 
     def moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Mean and covariance of the whole."""
@@ -33,15 +33,16 @@ def drawn(count: int, rng: np.random.Generator) -> Mixture:
         weight=weight / weight.sum(),
         mean=rng.normal(size=(count, 6)),
         cov=root @ root.transpose(0, 2, 1) + 0.01 * np.eye(6),
-        label=rng.integers(0, 4, count).astype(np.int8),
+        group=np.zeros(count, np.int64),
     )
 
 
 def merged(mixture: Mixture, max_divergence: float, noise: float = 0.0) -> Mixture:
-    weight, mean, cov, label = (np.array(v) for v in (mixture.weight, mixture.mean, mixture.cov, mixture.label))
-    alive = np.empty(len(weight), np.bool_)
-    halve_and_merge(weight, mean, cov, label, np.ones(6), np.full(6, noise), max_divergence, alive)
-    return Mixture(weight=weight[alive], mean=mean[alive], cov=cov[alive], label=label[alive])
+    weight, mean, cov = (np.array(v) for v in (mixture.weight, mixture.mean, mixture.cov))
+    into = halve_and_merge(weight, mean, cov, mixture.group, np.ones(6), np.full(6, noise), max_divergence)
+    alive = into == np.arange(len(weight))
+    np.testing.assert_allclose(np.bincount(into, mixture.weight, len(weight))[alive], weight[alive], rtol=1e-12)
+    return Mixture(weight=weight[alive], mean=mean[alive], cov=cov[alive], group=mixture.group[alive])
 
 
 @pytest.mark.parametrize("max_divergence", [1e-3, 1e-2, 0.1, np.inf])
@@ -64,7 +65,7 @@ def test_components_all_alike_become_one_for_nothing() -> None:
         weight=np.full(33, 1 / 33),
         mean=np.repeat(one.mean, 33, axis=0),
         cov=np.repeat(one.cov, 33, axis=0),
-        label=np.repeat(one.label, 33),
+        group=np.repeat(one.group, 33),
     )
     fewer = merged(many, 1e-9)
     assert len(fewer.weight) == 1
@@ -83,10 +84,14 @@ def test_two_components_merge_at_their_bound() -> None:
     assert len(merged(mixture, bound * (1.0 + 1e-9), noise).weight) == 1
 
 
-def test_the_heavier_label_stays() -> None:
-    mixture = drawn(2, np.random.default_rng(5))
-    weighted = Mixture(weight=np.array([0.4, 0.6]), mean=mixture.mean, cov=mixture.cov, label=np.array([3, 1], np.int8))
-    assert merged(weighted, np.inf).label.tolist() == [1]
+def test_groups_stay_apart() -> None:
+    mixture = drawn(100, np.random.default_rng(5))
+    grouped = Mixture(weight=mixture.weight, mean=mixture.mean, cov=mixture.cov, group=np.arange(100) % 3)
+    fewer = merged(grouped, np.inf)
+    for group in range(3):
+        ours, theirs = fewer.group == group, grouped.group == group
+        assert fewer.weight[ours].sum() == pytest.approx(grouped.weight[theirs].sum(), rel=1e-12)
+        assert np.count_nonzero(ours) < np.count_nonzero(theirs)
 
 
 def test_noise_merges_what_it_hides() -> None:
@@ -98,7 +103,7 @@ def test_noise_merges_what_it_hides() -> None:
         weight=np.full(40, 1 / 40),
         mean=place,
         cov=np.repeat(1e-4 * np.eye(6)[None], 40, axis=0),
-        label=np.zeros(40, np.int8),
+        group=np.zeros(40, np.int64),
     )
     assert len(merged(mixture, 1e-2).weight) == 40
     hidden = merged(mixture, 1e-2, noise=1.0)

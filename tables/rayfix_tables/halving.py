@@ -2,11 +2,13 @@
 
 A tree over the components is made by halving the box of their means along its longest side, again and again. From the
 leaves up, the two halves of a node become one component where that raises the divergence by no more than is allowed
-(the bound is Runnalls', see :mod:`rayfix_offline.merge`). Each component meets only its like, so the time grows with
-the number of components and not with that of their pairs.
+(the bound is that of A. R. Runnalls, "Kullback-Leibler approach to Gaussian mixture reduction", IEEE Trans. Aerosp.
+Electron. Syst. 43 (3), 2007: ``((w_i + w_j) log|P_ij| - w_i log|P_i| - w_j log|P_j|) / 2`` for components i and j and
+their union's covariance P_ij). Each component meets only its like, so the time grows with the number of components and
+not with that of their pairs.
 
-What no measurement tells apart need not be kept apart. The divergence is therefore that of the mixture *as it is
-measured*: noise is added to the ray coordinates before determinants are taken.
+What no measurement tells apart need not be kept apart: the divergence may be that of the mixture *as it is measured*,
+with noise added before determinants are taken.
 """
 
 from typing import Any
@@ -14,52 +16,53 @@ from typing import Any
 import numba
 import numpy as np
 
-from rayfix_offline.merge import SMALLEST_PIVOT
-from rayfix_offline.moments import SIZE
+SMALLEST_PIVOT = 1e-30
+"""A covariance that rounding has made singular counts as this thin."""
 
 
 @numba.njit(cache=True, nogil=True)
-def halve_and_merge(
-    weight: Any, mean: Any, cov: Any, label: Any, scale: Any, noise: Any, max_divergence: Any, alive: Any
-) -> None:
+def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, noise: Any, max_divergence: Any) -> Any:
     """Merge components, in place.
 
     Parameters
     ----------
     weight : ndarray of shape (n,)
         Sum to 1.
-    mean : ndarray of shape (n, 6)
-    cov : ndarray of shape (n, 6, 6)
-    label : ndarray of int8, shape (n,)
-        Carried along; of two merged components the heavier one's stays.
-    scale : ndarray of shape (6,)
+    mean : ndarray of shape (n, d)
+    cov : ndarray of shape (n, d, d)
+    group : ndarray of int64, shape (n,)
+        Components of different groups are not merged.
+    scale : ndarray of shape (d,)
         Lengths in the units of which the sides of a box are compared.
-    noise : ndarray of shape (6,)
+    noise : ndarray of shape (d,)
         Variances of the noise that measurements add.
     max_divergence : float
         What a merge may cost, nats.
-    alive : ndarray of bool, shape (n,)
-        Set to the components that are left.
+
+    Returns
+    -------
+    ndarray of int64, shape (n,)
+        Component that each one has become part of; its own number where it is left.
     """
-    count = len(weight)
-    order, left, right, size = _tree(mean, scale)
+    count, dimension = mean.shape
+    order, left, right, size = _tree(mean, group, scale)
     log_det = np.empty(count)
-    work = np.empty((SIZE, SIZE))
+    work = np.empty((dimension, dimension))
+    into = np.arange(count)
     for i in range(count):
-        alive[i] = True
         log_det[i] = _noisy_log_det(cov[i], noise, work)
     whole = np.full(size, -1, np.int64)  # the one component that a node has become
-    union = np.empty((SIZE, SIZE))
+    union = np.empty((dimension, dimension))
     for node in range(size - 1, -1, -1):
         if left[node] < 0:
             whole[node] = order[right[node]]
             continue
         i, j = whole[left[node]], whole[right[node]]
-        if i < 0 or j < 0:
+        if i < 0 or j < 0 or group[i] != group[j]:
             continue
         total = weight[i] + weight[j]
         share = weight[i] / total
-        for a in range(SIZE):
+        for a in range(dimension):
             apart = share * (1.0 - share) * (mean[i, a] - mean[j, a])
             for b in range(a + 1):
                 value = cov[j, a, b] + share * (cov[i, a, b] - cov[j, a, b]) + apart * (mean[i, b] - mean[j, b])
@@ -68,21 +71,23 @@ def halve_and_merge(
         united = _noisy_log_det(union, noise, work)
         if 0.5 * (total * united - weight[i] * log_det[i] - weight[j] * log_det[j]) > max_divergence:
             continue
-        if weight[j] > weight[i]:
-            label[i] = label[j]
-        for a in range(SIZE):
+        for a in range(dimension):
             mean[i, a] = mean[j, a] + share * (mean[i, a] - mean[j, a])
-            for b in range(SIZE):
+            for b in range(dimension):
                 cov[i, a, b] = union[a, b]
         weight[i] = total
         log_det[i] = united
-        alive[j] = False
+        into[j] = i
         whole[node] = i
+    for i in range(count):
+        while into[into[i]] != into[i]:
+            into[i] = into[into[i]]
+    return into
 
 
 @numba.njit(cache=True, nogil=True)
-def _tree(mean: Any, scale: Any) -> Any:
-    """Halve boxes until each holds one component.
+def _tree(mean: Any, group: Any, scale: Any) -> Any:
+    """Halve groups and then their boxes until each holds one component.
 
     Returns
     -------
@@ -92,7 +97,7 @@ def _tree(mean: Any, scale: Any) -> Any:
     size : int
         Number of nodes.
     """
-    count = len(mean)
+    count, dimension = mean.shape
     order = np.arange(count)
     most = 2 * count - 1
     first, stop = np.empty(most, np.int64), np.empty(most, np.int64)
@@ -106,8 +111,11 @@ def _tree(mean: Any, scale: Any) -> Any:
             left[node], right[node] = -1, begin
             node += 1
             continue
+        least, greatest = group[order[begin]], group[order[begin]]
+        for n in range(begin, end):
+            least, greatest = min(least, group[order[n]]), max(greatest, group[order[n]])
         longest, axis, middle = -1.0, 0, 0.0
-        for a in range(SIZE):
+        for a in range(dimension):
             low, high = np.inf, -np.inf
             for n in range(begin, end):
                 low, high = min(low, mean[order[n], a]), max(high, mean[order[n], a])
@@ -115,7 +123,8 @@ def _tree(mean: Any, scale: Any) -> Any:
                 longest, axis, middle = (high - low) / scale[a], a, 0.5 * (low + high)
         i, j = begin, end - 1
         while i <= j:
-            if mean[order[i], axis] < middle:
+            component = order[i]
+            if (group[component] == least) if greatest > least else (mean[component, axis] < middle):
                 i += 1
             else:
                 order[i], order[j] = order[j], order[i]
@@ -133,15 +142,16 @@ def _tree(mean: Any, scale: Any) -> Any:
 @numba.njit(cache=True, nogil=True)
 def _noisy_log_det(cov: Any, noise: Any, work: Any) -> Any:
     """Logarithm of the determinant of a covariance with noise; ``work`` has its shape."""
-    for a in range(SIZE):
+    dimension = len(cov)
+    for a in range(dimension):
         for b in range(a + 1):
             work[a, b] = cov[a, b]
         work[a, a] += noise[a]
     product = 1.0
-    for j in range(SIZE):
+    for j in range(dimension):
         pivot = max(work[j, j], SMALLEST_PIVOT)
         product *= pivot
-        for a in range(j + 1, SIZE):
+        for a in range(j + 1, dimension):
             factor = work[a, j] / pivot
             for b in range(j + 1, a + 1):
                 work[a, b] -= factor * work[b, j]
