@@ -45,11 +45,8 @@ class Calibration:
 
 
 def ellipsoid_holds(fix: Fix, probability: float, point: NDArray[np.float64]) -> bool:
-    """Whether the fix's credible ellipsoid of a probability holds a point of shape (3,), m.
-
-    The ellipsoid is that of the best candidate's covariance with the radius of a Gaussian.
-    """
-    return _within(fix.candidates[0], probability, point)
+    """Whether the fix's credible ellipsoid of a probability holds a point of shape (3,), m; without a position, no."""
+    return fix.regions is not None and fix.regions.ellipsoid(probability).holds(point)
 
 
 def calibrate(located: Sequence[LocatedDrop], probabilities: Sequence[float]) -> Calibration:

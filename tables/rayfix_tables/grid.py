@@ -1,5 +1,6 @@
 """The angular grid: rings of constant zenith, each cut into cells of about equal width."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -75,3 +76,15 @@ class AngularGrid:
         turn = (wrap(azimuth) + np.pi) / (2.0 * np.pi)
         step = np.minimum((turn * cells).astype(np.int64), cells - 1)
         return self.ring_offsets[ring] + step
+
+    def cell_around(self, azimuth: float, zenith: float) -> tuple[int, float, float]:
+        """Cell that holds one direction, and the azimuth and zenith of its centre, rad.
+
+        The same as :meth:`nearest` and :attr:`centres`, without arrays: a report looks up a few directions only.
+        """
+        ring = min(max(int(zenith * self.num_rings / math.pi), 0), self.num_rings - 1)
+        cells = int(self.ring_cells[ring])
+        turn = (math.remainder(azimuth, 2.0 * math.pi) + math.pi) / (2.0 * math.pi)
+        step = min(int(turn * cells), cells - 1)
+        centre = -math.pi + (step + 0.5) * 2.0 * math.pi / cells
+        return int(self.ring_offsets[ring]) + step, centre, (ring + 0.5) * math.pi / self.num_rings

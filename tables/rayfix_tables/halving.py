@@ -61,7 +61,7 @@ def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, no
         if i < 0 or j < 0 or group[i] != group[j]:
             continue
         total = weight[i] + weight[j]
-        share = weight[i] / total
+        share = weight[i] / total if total > 0.0 else 0.5
         for a in range(dimension):
             apart = share * (1.0 - share) * (mean[i, a] - mean[j, a])
             for b in range(a + 1):

@@ -7,6 +7,8 @@ from scipy.stats import binomtest
 
 from rayfix.evaluation.accuracy import Drop, LocatedDrop
 from rayfix.evaluation.calibration import calibrate, ellipsoid_holds, wilson_interval
+from rayfix_service.fusion.credible import CredibleRegions
+from rayfix_service.fusion.normal import normal_points
 from rayfix_service.fusion.report import Candidate, Fix
 
 COV = np.array([[0.5, 0.2, 0.0], [0.2, 0.3, 0.1], [0.0, 0.1, 0.4]])
@@ -16,7 +18,9 @@ def fix_of(*positions: NDArray[np.float64], cov: NDArray[np.float64] = COV) -> F
     candidates = tuple(
         Candidate(probability=1.0 / (n + 2), position=position, covariance=cov) for n, position in enumerate(positions)
     )
-    return Fix(status="ok", candidates=candidates, outcomes=(), log_evidence=0.0, table_id="")
+    points = positions[0] + normal_points(1024) @ np.linalg.cholesky(cov).T
+    regions = CredibleRegions(position=positions[0], covariance=cov, points=points, share=1.0)
+    return Fix(status="ok", candidates=candidates, outcomes=(), log_evidence=0.0, table_id="", regions=regions)
 
 
 def located(truth: NDArray[np.float64], fix: Fix, bound: float = 0.1) -> LocatedDrop:
@@ -42,9 +46,16 @@ def test_ellipsoids_of_gaussian_errors_cover_what_they_say() -> None:
     count = 4000
     errors = rng.multivariate_normal(np.zeros(3), COV, size=count)
     for probability in (0.5, 0.68, 0.9, 0.99):
-        inside = sum(ellipsoid_holds(fix_of(np.ones(3)), probability, np.ones(3) + error) for error in errors)
+        fix = fix_of(np.ones(3))
+        inside = sum(ellipsoid_holds(fix, probability, np.ones(3) + error) for error in errors)
         low, high = wilson_interval(inside, count, 0.9999)
-        assert low < probability < high
+        # The ellipsoid itself is as exact as a thousand points are.
+        assert low - 0.003 < probability < high + 0.003
+
+
+def test_without_a_position_nothing_is_held() -> None:
+    nothing = Fix(status="insufficient", candidates=(), outcomes=(), log_evidence=0.0, table_id="")
+    assert not ellipsoid_holds(nothing, 0.99, np.zeros(3))
 
 
 def test_gross_failures_and_right_rivals_are_told_apart() -> None:

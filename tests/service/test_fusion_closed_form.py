@@ -341,7 +341,7 @@ def assert_equal(fix: Fix, expected: Posterior) -> None:
 
 
 TUBES = [line_of_sight("a"), line_of_sight("b", log_mass=0.3), line_of_sight("c", log_mass=-0.5)]
-EXACT = FusionSettings(component_floor=1e-30, hypothesis_floor=1e-30)
+EXACT = FusionSettings(component_floor=1e-30, hypothesis_floor=1e-30, max_divergence=0.0)
 
 
 def lengths(shift: float = 0.0) -> dict[str, float]:
@@ -423,7 +423,7 @@ def test_a_fix_of_known_height_equals_its_closed_form(make_table: MakeTable, kin
 
 def test_a_sharp_height_cuts_the_posterior_at_its_plane(make_table: MakeTable) -> None:
     """The paper's two-dimensional case: the Gaussian over (x, y) given z, by the formula for conditional Gaussians."""
-    never = FusionSettings(outlier_probability=1e-15)
+    never = FusionSettings(outlier_probability=1e-15, max_divergence=0.0)
     locator = Locator(make_table(*TUBES), never)
     whole = oracle(TUBES, measured("aoa+pt"))
     z = 1.35
@@ -558,7 +558,7 @@ def test_a_reference_that_is_late_spoils_all_its_differences(make_table: MakeTab
 
 def test_time_differences_to_one_reference_are_correlated(make_table: MakeTable) -> None:
     """Generalised least squares with the covariance s^2 (I + 1 1^T) of two differences of deviation sqrt(2) s."""
-    never = FusionSettings(outlier_probability=1e-15)
+    never = FusionSettings(outlier_probability=1e-15, max_divergence=0.0)
     measurements = differences("a")
     fix = Locator(make_table(*TUBES), never).locate(report_of(measurements))
     covs = []

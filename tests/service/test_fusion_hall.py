@@ -14,6 +14,7 @@ from rayfix.evaluation.simulate import Noise, Timing, simulate_report, uniform_d
 from rayfix_service.fusion import reference
 from rayfix_service.fusion.beam import multiply
 from rayfix_service.fusion.factors import TIME_OUTLIER, Factor, make_factor
+from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.observations import sort_report
 from rayfix_service.fusion.prior import Prior, even_prior
@@ -36,6 +37,7 @@ from rayfix_tables.table import Table
 Array = NDArray[np.float64]
 
 TIMINGS: tuple[Timing, ...] = ("none", "pt", "toa")
+DEFAULT = FusionSettings()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +95,12 @@ def assert_same(fix: Fix, expected: Fix, tolerance: float) -> None:
         assert one.probability == pytest.approx(other.probability, abs=tolerance)
 
 
-def factors_of(hall: Hall, report: Report, most: int) -> tuple[list[Factor], int]:
-    """Factors of a report, of each the ``most`` best alternatives and the outlier; and the number of clocks."""
+def factors_of(hall: Hall, report: Report, most: int, place: Array) -> tuple[list[Factor], int]:
+    """Factors of a report, of each the ``most`` best alternatives and the outlier; and the number of clocks.
+
+    The best are those that are likely within half a metre or so of a place: the alternatives of all stations then
+    agree, as those of a whole report do.
+    """
     sorted_report = sort_report(report, hall.table.site)
     log_volume = float(np.log(hall.table.scene.free_space.volume))
     log_range = np.log(hall.table.site.max_path_length)
@@ -102,14 +108,21 @@ def factors_of(hall: Hall, report: Report, most: int) -> tuple[list[Factor], int
     for observation in sorted_report.observations:
         factor = make_factor(
             observation,
-            hall.table.parts[observation.station_id],
+            HeardStation(hall.table.parts[observation.station_id]),
             num_clocks=sorted_report.num_clocks,
             max_path_length=hall.table.site.max_path_length,
             prior=Prior(log_volume=log_volume),
-            settings=FusionSettings(),
+            settings=replace(DEFAULT, max_divergence=0.0),
         )
         assert factor is not None
-        score = reference.log_integral(factor.information, factor.eta, factor.log_scale, log_volume, log_range)
+        near = np.diag([*np.full(3, 0.5**-2), *np.zeros(sorted_report.num_clocks)])
+        score = reference.log_integral(
+            factor.information + near,
+            factor.eta + near[:, :3] @ place,
+            factor.log_scale,
+            log_volume,
+            log_range,
+        )
         keep = np.sort(np.concatenate([np.argsort(-score[:-1])[:most], [len(factor) - 1]]))
         factors.append(
             Factor(
@@ -122,8 +135,8 @@ def factors_of(hall: Hall, report: Report, most: int) -> tuple[list[Factor], int
     return factors, sorted_report.num_clocks
 
 
-def exhaustive(hall: Hall, factors: list[Factor], num_clocks: int) -> tuple[Array, Array]:
-    """Log weights, the best first, and mean positions of all products that say something of the position."""
+def exhaustive(hall: Hall, factors: list[Factor], num_clocks: int) -> tuple[Array, Array, Array]:
+    """Log weights, the best first, mean positions and covariances of all products that tell of the position."""
     log_volume = float(np.log(hall.table.scene.free_space.volume))
     log_range = float(np.log(hall.table.site.max_path_length))
     size = 3 + num_clocks
@@ -138,22 +151,24 @@ def exhaustive(hall: Hall, factors: list[Factor], num_clocks: int) -> tuple[Arra
     placed = information[:, 0, 0] > 0.0
     information, eta = information[placed], eta[placed]
     unknown = np.diagonal(information, axis1=1, axis2=2) <= 0.0
-    mean = np.linalg.solve(information + unknown[:, None] * np.eye(size), eta[:, :, None])[:, :3, 0]
-    return score[placed], np.asarray(mean, np.float64)
+    cov = np.asarray(np.linalg.inv(information + unknown[:, None] * np.eye(size)), np.float64)
+    return score[placed], np.einsum("hij,hj->hi", cov, eta)[:, :3], cov[:, :3, :3]
 
 
 @pytest.mark.parametrize("timing", TIMINGS)
 def test_the_beam_finds_what_the_exhaustive_product_finds(hall: Hall, timing: Timing) -> None:
     """All of some 40 000 products of the twelve best alternatives of each station, for every third place.
 
-    A beam that is wide enough keeps all of them, the default one the best and nearly all of their weight: it loses at
-    most as much as there is beyond its 256 best products, which are hundreds of nearly equal ones.
+    Without merging a beam that is wide enough keeps all of them that can matter. The default one merges: mostly a
+    thousandth of a nat and of the posterior's width is lost, at worst some hundredths.
     """
+    evidence_errors, shifts = [], []
     for n in range(TIMINGS.index(timing), 100, 3):
-        factors, num_clocks = factors_of(hall, hall.report(n, timing), 12)
-        log_weight, mean = exhaustive(hall, factors, num_clocks)
+        factors, num_clocks = factors_of(hall, hall.report(n, timing), 12, hall.drops[n].position)
+        log_weight, mean, cov = exhaustive(hall, factors, num_clocks)
         log_sum = np.logaddexp.reduce(log_weight)
         share = np.exp(log_weight - log_sum)
+        whole_mean = share @ mean
         products = partial(
             multiply,
             factors,
@@ -161,29 +176,50 @@ def test_the_beam_finds_what_the_exhaustive_product_finds(hall: Hall, timing: Ti
             max_path_length=hall.table.site.max_path_length,
             prior=even_prior(hall.table.scene.free_space),
         )
-        whole = products(width=len(log_weight) + 1)
-        np.testing.assert_allclose(whole.log_weight, log_weight, rtol=0, atol=1e-6)  # nats
-        np.testing.assert_allclose(
-            np.exp(whole.log_weight - log_sum) @ whole.mean, share @ mean, rtol=0, atol=1e-6
-        )  # m
-        beam = products(width=256)
-        likely = int((share > 2e-3).sum())
-        np.testing.assert_allclose(beam.log_weight[:likely], log_weight[:likely], rtol=0, atol=1e-6)
-        np.testing.assert_allclose(beam.mean[0], mean[0], rtol=0, atol=1e-6)  # m
+        whole = products(width=len(log_weight) + 1, max_divergence=0.0)
+        # What the beam gives up is 30 nats below the best before the last factor is known.
+        likely = int((share > 1e-4).sum())
+        np.testing.assert_allclose(whole.log_weight[:likely], log_weight[:likely], rtol=0, atol=1e-6)  # nats
+        kept = np.exp(whole.log_weight - log_sum)
+        assert kept.sum() == pytest.approx(1.0, abs=1e-4)
+        np.testing.assert_allclose(kept @ whole.mean, whole_mean, rtol=0, atol=1e-3)  # m
+        beam = products(width=DEFAULT.beam_width, max_divergence=DEFAULT.max_divergence)
         kept = np.exp(beam.log_weight - log_sum)
-        assert kept.sum() > 0.99
-        np.testing.assert_allclose(kept @ beam.mean / kept.sum(), share @ mean, rtol=0, atol=5e-3)  # m
+        width = math.sqrt(share @ (np.trace(cov, axis1=1, axis2=2) + ((mean - whole_mean) ** 2).sum(axis=1)))  # m
+        evidence_errors.append(abs(math.log(kept.sum())))
+        shifts.append(np.linalg.norm(kept @ beam.mean / kept.sum() - whole_mean) / width)
+    assert max(evidence_errors) < 0.05  # nats
+    assert np.median(evidence_errors) < 1e-3
+    assert max(shifts) < 0.1  # of the posterior's standard deviation
+    assert np.median(shifts) < 2e-3
 
 
 @pytest.mark.parametrize("timing", TIMINGS)
-def test_a_wider_beam_gives_the_same_fix(hall: Hall, timing: Timing) -> None:
-    wide = Locator(hall.table, FusionSettings(beam_width=8192))
+def test_a_wider_beam_without_merging_gives_the_same_fix(hall: Hall, timing: Timing) -> None:
+    """And the whole posterior is nearly the same: its divergence (Kullback-Leibler), by samples.
+
+    A shoulder of a hill may just be a hill by itself or just be none; mostly the hills are the same.
+    """
+    wide = Locator(hall.table, FusionSettings(beam_width=8192, max_divergence=0.0))
+    same_hills = 0
     for n in range(0, 100, 12):
         report = hall.report(n, timing)
         fix, expected = hall.locator.locate(report), wide.locate(report)
-        assert fix.status == expected.status
-        assert best(fix).probability == pytest.approx(best(expected).probability, abs=0.01)
-        assert np.linalg.norm(best(fix).position - best(expected).position) < 0.005  # m
+        assert fix.log_evidence == pytest.approx(expected.log_evidence, abs=0.1)
+        assert fix.regions is not None
+        assert expected.regions is not None
+        assert fix.regions.horizontal_radius(0.68) == pytest.approx(expected.regions.horizontal_radius(0.68), rel=0.1)
+        posterior = wide.posterior(report)
+        drawn = posterior.sample(300, np.random.default_rng(n))
+        lost = posterior.log_density(drawn) - hall.locator.posterior(report).log_density(drawn)
+        assert lost.mean() < 0.05  # nats
+        hills = [sum(candidate.probability > 0.03 for candidate in one.candidates) for one in (fix, expected)]
+        if hills[0] == hills[1]:
+            same_hills += 1
+            assert fix.status == expected.status
+            assert best(fix).probability == pytest.approx(best(expected).probability, abs=0.04)
+            assert np.linalg.norm(best(fix).position - best(expected).position) < 0.01  # m
+    assert same_hills >= 6  # of nine
 
 
 def test_however_many_times_a_path_has_they_may_be_outliers(hall: Hall) -> None:
@@ -195,7 +231,7 @@ def test_however_many_times_a_path_has_they_may_be_outliers(hall: Hall) -> None:
         for name in others[:2]
     ]
     crowded = Report(measurements=(*report.measurements, *differences))
-    (factor, *_), num_clocks = factors_of(hall, crowded, 1000)
+    (factor, *_), num_clocks = factors_of(hall, crowded, 1000, hall.drops[0].position)
     assert num_clocks == 2
     assert np.count_nonzero(factor.outlier == TIME_OUTLIER) > 10
 

@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 from rayfix_service.fusion import kernels, mode_kernels, reference
 from rayfix_service.fusion.factors import ALL_GOOD, make_factor
+from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.likelihood import Term, gaussian_terms, log_normal_terms, spreads
 from rayfix_service.fusion.lookup import Direction
 from rayfix_service.fusion.modes import unit_points
@@ -172,9 +173,10 @@ def test_extend_beam_keeps_the_best_of_all_products(seed: int, states: tuple[Tim
     first, second, dimension = states
     hypotheses = random_factor(rng, 12, first, dimension)
     factor = random_factor(rng, 15, (second[0], second[1], wide * second[2]), dimension)
-    parent, choice, score = kernels.extend_beam(*hypotheses, *factor, 40, LOG_VOLUME, LOG_RANGE)
+    parent, choice, score = kernels.extend_beam(*hypotheses, *factor, 40, np.inf, LOG_VOLUME, LOG_RANGE)
     all_parents, all_choices, all_scores = reference.extend_beam(*hypotheses, *factor, LOG_VOLUME, LOG_RANGE)
     assert len(all_scores) == 12 * 15
+    assert (np.diff(score) <= 0.0).all()
     np.testing.assert_allclose(score, all_scores[:40], rtol=0, atol=1e-7)  # nats
     clear = np.flatnonzero(-np.diff(all_scores[:41]) > 1e-6)  # before each of these ends a set without ties
     last = clear[-1] + 1
@@ -186,9 +188,20 @@ def test_extend_beam_keeps_the_best_of_all_products(seed: int, states: tuple[Tim
 def test_extend_beam_takes_all_products_when_they_are_few() -> None:
     rng = np.random.default_rng(5)
     hypotheses, factor = random_factor(rng, 3, NO_TIME, 3), random_factor(rng, 4, NO_TIME, 3)
-    parent, choice, score = kernels.extend_beam(*hypotheses, *factor, 256, LOG_VOLUME, LOG_RANGE)
+    *_, expected = reference.extend_beam(*hypotheses, *factor, LOG_VOLUME, LOG_RANGE)
+    parent, choice, score = kernels.extend_beam(*hypotheses, *factor, 256, np.inf, LOG_VOLUME, LOG_RANGE)
     assert sorted(zip(parent.tolist(), choice.tolist(), strict=True)) == [(h, k) for h in range(3) for k in range(4)]
-    assert (np.diff(score) <= 0.0).all()
+    np.testing.assert_allclose(score, expected, rtol=0, atol=1e-7)  # nats
+
+
+def test_extend_beam_gives_up_hopeless_products() -> None:
+    rng = np.random.default_rng(5)
+    hypotheses, factor = random_factor(rng, 3, NO_TIME, 3), random_factor(rng, 4, NO_TIME, 3)
+    *_, expected = reference.extend_beam(*hypotheses, *factor, LOG_VOLUME, LOG_RANGE)
+    hopeful = expected > expected[0] - 30.0
+    assert 1 < np.count_nonzero(hopeful) < 12
+    *_, score = kernels.extend_beam(*hypotheses, *factor, 256, 30.0, LOG_VOLUME, LOG_RANGE)
+    np.testing.assert_allclose(score, expected[hopeful], rtol=0, atol=1e-7)  # nats
 
 
 def test_cut_gaussians_equals_its_twin() -> None:
@@ -300,9 +313,11 @@ def test_closed_form_conditioning_agrees_with_sampling(seed: int, error: str) ->
         angle_index=0,
         timing_indices=(1,),
     )
-    fusion = FusionSettings(component_floor=1e-12)
+    fusion = FusionSettings(component_floor=1e-12, max_divergence=0.0)
     prior = Prior(log_volume=LOG_VOLUME)
-    factor = make_factor(observation, part, num_clocks=0, max_path_length=60.0, prior=prior, settings=fusion)
+    factor = make_factor(
+        observation, HeardStation(part), num_clocks=0, max_path_length=60.0, prior=prior, settings=fusion
+    )
     assert factor is not None
     good = factor.outlier == ALL_GOOD
     log_evidence = log_integrals((factor.information[good], factor.eta[good], factor.log_scale[good]))

@@ -6,7 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.lookup import NO_DIRECTION, Direction, Lookup, look_up
+from rayfix_service.fusion.lookup import NO_DIRECTION, SUM_RATIO, Direction, Lookup, look_up
 from rayfix_tables.angles import angles_of, local_to_scene, wrap
 from rayfix_tables.angles import direction as direction_of
 from rayfix_tables.grid import AngularGrid
@@ -96,7 +96,9 @@ def test_one_cell_represents_the_measurement_exactly(
     """Also across azimuth +-180 degrees and at the poles."""
     direction = measured(azimuth, zenith, noise)
     assume(WINDOW_RATIO * widest(LEVELS[-1], direction) < LEVELS[-1].window)
-    lookup = look_up(LEVELS, direction)
+    # Without the finer levels, which may answer by a sum.
+    served = tuple(level for level in LEVELS if WINDOW_RATIO * widest(level, direction) < level.window)
+    lookup = look_up(served, direction)
     assert len(lookup.cells) == 1
     centre_azimuth, centre_zenith = lookup.level.grid.centres[lookup.cells[0]]
     stretch = np.diag([np.sin(centre_zenith), 1.0])
@@ -129,19 +131,37 @@ def test_the_cell_is_the_one_that_holds_the_direction() -> None:
 def test_the_finest_level_that_is_wide_enough_answers(
     azimuth: float, zenith: float, noise: tuple[float, float, float]
 ) -> None:
+    """By one cell where its window serves the noise, by a sum of cells up to ``SUM_RATIO`` times that."""
     direction = measured(azimuth, zenith, noise)
     fits = [WINDOW_RATIO * widest(level, direction) / level.window for level in LEVELS]
     assume(min(abs(np.array(fits) - 1.0)) > 1e-6)
+    assume(min(abs(np.array(fits) - SUM_RATIO)) > 1e-6)
     lookup = look_up(LEVELS, direction)
-    expected = next((level for level, fit in zip(LEVELS, fits, strict=True) if fit < 1.0), LEVELS[-1])
+    expected = next((level for level, fit in zip(LEVELS, fits, strict=True) if fit < SUM_RATIO), LEVELS[-1])
     assert lookup.level is expected
+    if fits[LEVELS.index(expected)] < 1.0:
+        assert len(lookup.cells) == 1
 
 
-@pytest.mark.parametrize(("stdev_deg", "window_deg"), [(1.0, 1.25), (1.001, 5.0), (4.0, 5.0), (12.0, 15.0)])
-def test_noise_of_exactly_four_fifths_of_a_window_is_served(stdev_deg: float, window_deg: float) -> None:
+@pytest.mark.parametrize(
+    ("stdev_deg", "window_deg", "one_cell"),
+    [
+        (1.0, 1.25, True),
+        (1.001, 1.25, False),
+        (1.599, 1.25, False),
+        (1.601, 5.0, True),
+        (4.0, 5.0, True),
+        (6.399, 5.0, False),
+        (6.401, 15.0, True),
+        (12.0, 15.0, True),
+    ],
+)
+def test_noise_of_exactly_four_fifths_of_a_window_is_served_by_a_cell(
+    stdev_deg: float, window_deg: float, one_cell: bool
+) -> None:
     lookup = look_up(LEVELS, measured(1.0, 0.5 * np.pi, (0.1, stdev_deg, 0.0)))
     assert np.rad2deg(lookup.level.window) == pytest.approx(window_deg)
-    assert len(lookup.cells) == 1
+    assert (len(lookup.cells) == 1) is one_cell
 
 
 def test_without_an_angle_all_cells_add_up_to_one() -> None:
@@ -234,9 +254,15 @@ def test_an_azimuth_alone_in_a_tilted_frame(
     assert np.abs(found - expected)[there].max() < 0.25 * expected.max()
 
 
-@pytest.mark.parametrize(("inside", "level"), [(0.999, 0), (1.001, 1)])
-def test_on_either_side_of_a_switch_of_levels_the_likelihood_is_the_same(inside: float, level: int) -> None:
-    azimuth, zenith, stdev_deg = 0.7, 1.3, inside * 1.0
+@pytest.mark.parametrize(
+    ("stdev_deg", "level", "tolerance"),
+    [(0.999, 0, 1e-6), (1.001, 0, 0.06), (1.599, 0, 0.06), (1.601, 1, 1e-6)],
+)
+def test_on_either_side_of_a_switch_of_levels_the_likelihood_is_the_same(
+    stdev_deg: float, level: int, tolerance: float
+) -> None:
+    """One cell is exact; in a sum, weights from cell to cell do not quite add up to 1."""
+    azimuth, zenith = 0.7, 1.3
     lookup = look_up(LEVELS, measured(azimuth, zenith, (stdev_deg, stdev_deg, 0.0)))
     assert lookup.level is LEVELS[level]
     apart = np.random.default_rng(0).standard_normal((200, 2)) * np.deg2rad(stdev_deg)
@@ -244,7 +270,8 @@ def test_on_either_side_of_a_switch_of_levels_the_likelihood_is_the_same(inside:
     rings = lookup.level.grid.num_rings
     sine = np.sin((np.floor(zenith * rings / np.pi) + 0.5) * np.pi / rings)
     expected = np.exp(log_normal(apart * [sine, 1.0], np.diag([sine, 1.0]) ** 2 * np.deg2rad(stdev_deg) ** 2))
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    near = (apart**2).sum(axis=1) < (2.0 * np.deg2rad(stdev_deg)) ** 2
+    np.testing.assert_allclose(found[near], expected[near], rtol=tolerance)
 
 
 @pytest.mark.parametrize("zenith", [0.0, 0.02, np.pi])

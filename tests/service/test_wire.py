@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from scipy.stats import chi2
 
+from rayfix_service.fusion.credible import CredibleRegions
+from rayfix_service.fusion.normal import normal_points
 from rayfix_service.fusion.report import (
     HEAVY_TAILED,
     Angle,
@@ -32,11 +35,9 @@ from rayfix_service.wire import (
     InvalidReportError,
     MalformedJsonError,
     fix_to_document,
-    horizontal_accuracy,
     parse_report,
     path_text,
     problems_of,
-    vertical_accuracy,
 )
 from rayfix_tables.errors import ReportError
 
@@ -283,6 +284,8 @@ BAD: dict[str, tuple[Any, tuple[str | int, ...], list[str]]] = {
     "empty object": ({}, ("measurements",), ["missing", "1 to 256"]),
     "no measurement": ({"measurements": []}, ("measurements",), ["length 0", "1 to 256"]),
     "too many": ({"measurements": [PT] * 257}, ("measurements",), ["length 257", "1 to 256"]),
+    "confidence 1": ({"measurements": [PT], "confidence": 1}, ("confidence",), ["is 1", "0.01 to 0.99"]),
+    "confidence %": ({"measurements": [PT], "confidence": "95%"}, ("confidence",), ["'95%'", "0.01 to 0.99"]),
     "measurements object": ({"measurements": AOA}, ("measurements",), ["an object", "give an array"]),
     "measurement text": ({"measurements": ["x"]}, M0, ["'x'", "JSON object"]),
     "no type": (changed(AOA, "type"), (*M0, "type"), ["missing", "aoa, pt, toa, tdoa, rssi"]),
@@ -546,40 +549,38 @@ def gaussian(xx: float, xy: float, yy: float, zz: float = 1.0) -> np.ndarray:
     return np.array([[xx, xy, 0.0], [xy, yy, 0.0], [0.0, 0.0, zz]])
 
 
-@pytest.mark.parametrize(
-    ("covariance", "radius"),
-    [
-        (gaussian(4.0, 0.0, 4.0), 2.0 * math.sqrt(-2.0 * math.log(0.32))),  # round: Rayleigh's quantile
-        (gaussian(9.0, 0.0, 0.0), 3.0 * 0.994457883209753),  # a line: the normal quantile of 0.84
-        (gaussian(0.5, 0.5, 0.5), 0.994457883209753),  # a line along the diagonal, deviation 1
-        (gaussian(0.0, 0.0, 0.0), 0.0),
-    ],
-)
-def test_horizontal_accuracy_where_a_closed_form_exists(covariance: np.ndarray, radius: float):
-    assert horizontal_accuracy(covariance) == pytest.approx(radius, rel=1e-9)
+def regions_of(candidate: Candidate, share: float = 1.0) -> CredibleRegions:
+    """Regions of a fix whose posterior is one Gaussian, but for this share."""
+    points = candidate.position + normal_points(1024) @ np.linalg.cholesky(candidate.covariance).T
+    return CredibleRegions(position=candidate.position, covariance=candidate.covariance, points=points, share=share)
 
 
-@pytest.mark.parametrize("yy", [0.5, 0.1, 0.01])
-def test_the_circle_holds_what_it_claims(yy: float):
-    rng = np.random.default_rng(5)
-    points = rng.normal(size=(200_000, 2)) * np.sqrt([1.0, yy])
-    for confidence in (0.5, 0.68, 0.95):
-        radius = horizontal_accuracy(gaussian(1.0, 0.0, yy), confidence)
-        share = np.mean(np.hypot(*points.T) <= radius)
-        assert share == pytest.approx(confidence, abs=0.005)  # four standard errors
+@pytest.mark.parametrize(("confidence", "share"), [(0.5, 1.0), (0.68, 0.9), (0.95, 1.0), (0.95, 0.9)])
+def test_the_accuracies_are_those_of_the_confidence_asked_for(confidence: float, share: float):
+    candidate = Candidate(probability=0.9, position=np.array([1.0, 2.0, 0.5]), covariance=gaussian(4.0, 0.5, 2.0))
+    regions = regions_of(candidate, share)
+    fix = Fix(
+        status="ok",
+        candidates=(candidate,),
+        outcomes=(),
+        log_evidence=0.0,
+        table_id="id",
+        regions=regions,
+        confidence=confidence,
+    )
+    document = fix_to_document(fix, 0.001)
+    assert document["horizontal_accuracy_m"] == regions.horizontal_radius(confidence)
+    assert document["vertical_accuracy_m"] == regions.vertical_half_height(confidence)
+    axes = np.array(document["ellipsoid_semi_axes_m"])
+    np.testing.assert_allclose(axes.T @ axes, regions.ellipsoid(confidence).shape, rtol=0, atol=1e-12)
+    assert (np.diff(np.linalg.norm(axes, axis=1)) <= 0.0).all()
+    # No region is more probable than that anything but an outlier was measured.
+    assert document["confidence"] == min(confidence, share)
 
 
-@given(st.floats(1e-4, 1.0), st.floats(-math.pi, math.pi), st.floats(1e-3, 1e3))
-def test_horizontal_accuracy_turns_and_scales_with_the_scene(ratio: float, angle: float, scale: float):
-    c, s = math.cos(angle), math.sin(angle)
-    turn = np.array([[c, -s], [s, c]])
-    (xx, xy), (_, yy) = turn @ np.diag([1.0, ratio]) @ turn.T * scale**2
-    expected = horizontal_accuracy(gaussian(1.0, 0.0, ratio)) * scale
-    assert horizontal_accuracy(gaussian(xx, xy, yy)) == pytest.approx(expected, rel=1e-9)
-
-
-def test_vertical_accuracy_is_a_normal_quantile():
-    assert vertical_accuracy(gaussian(1.0, 0.0, 1.0, zz=0.25)) == pytest.approx(0.5 * 0.994457883209753)
+def test_a_confidence_comes_across():
+    assert parse_report({"measurements": [PT], "confidence": 0.95}).confidence == 0.95
+    assert parse_report({"measurements": [PT]}).confidence == 0.68
 
 
 def test_a_fix_becomes_the_documented_answer():
@@ -594,13 +595,16 @@ def test_a_fix_becomes_the_documented_answer():
         ),
         log_evidence=-3.0,
         table_id="ab" * 32,
+        regions=regions_of(near),
         target_id="agv-7",
         timestamp="2026-01-31T10:00:00.250Z",
     )
     document = json.loads(json.dumps(fix_to_document(fix, 0.0012345), allow_nan=False))
     horizontal, vertical = document.pop("horizontal_accuracy_m"), document.pop("vertical_accuracy_m")
-    assert horizontal == pytest.approx(2.0 * math.sqrt(-2.0 * math.log(0.32)))
-    assert vertical == pytest.approx(0.994457883209753)
+    assert horizontal == pytest.approx(2.0 * math.sqrt(-2.0 * math.log(0.32)), rel=0.02)
+    assert vertical == pytest.approx(0.994457883209753, rel=0.02)
+    lengths = np.linalg.norm(document.pop("ellipsoid_semi_axes_m"), axis=1)
+    np.testing.assert_allclose(lengths, math.sqrt(chi2.ppf(0.68, 3)) * np.array([2.0, 2.0, 1.0]), rtol=0.05)
     assert document == {
         "target_id": "agv-7",
         "timestamp": "2026-01-31T10:00:00.250Z",
@@ -651,6 +655,7 @@ def test_a_fix_without_candidates_has_no_position():
         "covariance_m2",
         "horizontal_accuracy_m",
         "vertical_accuracy_m",
+        "ellipsoid_semi_axes_m",
         "target_id",
         "timestamp",
     ):
@@ -658,12 +663,14 @@ def test_a_fix_without_candidates_has_no_position():
 
 
 def test_answer_and_schema_have_the_same_keys():
+    candidate = Candidate(probability=1.0, position=np.zeros(3), covariance=np.eye(3))
     fix = Fix(
         status="ok",
-        candidates=(Candidate(probability=1.0, position=np.zeros(3), covariance=np.eye(3)),),
+        candidates=(candidate,),
         outcomes=(Outcome(used=False, reason="x"),),
         log_evidence=0.0,
         table_id="ab" * 32,
+        regions=regions_of(candidate),
     )
     document = fix_to_document(fix, 0.001)
     assert FixDocument.model_validate(document).model_dump(mode="json") == document

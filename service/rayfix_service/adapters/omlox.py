@@ -6,7 +6,6 @@ from typing import Any
 
 from rayfix_service.adapters.positions import best_candidate
 from rayfix_service.fusion.report import Fix
-from rayfix_service.wire import horizontal_accuracy, vertical_accuracy
 from rayfix_tables.site import SiteInfo
 
 UNKNOWN_PROVIDER = "unknown"
@@ -24,20 +23,20 @@ def fix_to_omlox(fix: Fix, site: SiteInfo) -> dict[str, Any]:
     ReportError
         When the fix has no position.
     """
-    candidate = best_candidate(fix)
+    candidate, regions = best_candidate(fix)
     location: dict[str, Any] = {
         "position": {"type": "Point", "coordinates": candidate.position.tolist()},
         "source": site.name,
         "provider_type": UNKNOWN_PROVIDER,
         "provider_id": fix.target_id or UNKNOWN_PROVIDER,
         "crs": "local",
-        "accuracy": horizontal_accuracy(candidate.covariance),
+        "accuracy": regions.horizontal_radius(fix.confidence),
         "elevation_ref": "floor",
         "floor": 0,
         "properties": {
             "rayfix.status": fix.status,
             "rayfix.probability": float(candidate.probability),
-            "rayfix.vertical_accuracy_m": vertical_accuracy(candidate.covariance),
+            "rayfix.vertical_accuracy_m": regions.vertical_half_height(fix.confidence),
             "rayfix.covariance_m2": candidate.covariance.tolist(),
             "rayfix.table_id": fix.table_id,
         },

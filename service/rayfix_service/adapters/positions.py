@@ -1,19 +1,20 @@
 """What formats that know one position alone take from a fix."""
 
+from rayfix_service.fusion.credible import CredibleRegions
 from rayfix_service.fusion.report import Candidate, Fix
 from rayfix_tables.errors import ReportError
 
 
-def best_candidate(fix: Fix) -> Candidate:
-    """Return the most probable candidate.
+def best_candidate(fix: Fix) -> tuple[Candidate, CredibleRegions]:
+    """Return the most probable candidate and the regions around it.
 
     Raises
     ------
     ReportError
         When the fix has none.
     """
-    if fix.candidates:
-        return fix.candidates[0]
+    if fix.candidates and fix.regions is not None:
+        return fix.candidates[0], fix.regions
     reasons = "; ".join(
         f"measurements[{n}]: {outcome.reason}" for n, outcome in enumerate(fix.outcomes) if not outcome.used
     )

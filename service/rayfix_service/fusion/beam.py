@@ -1,13 +1,14 @@
-"""Multiply factors: hypotheses that pick one alternative of each, the best of them kept."""
+"""Multiply factors: hypotheses that pick one alternative of each, the best of them kept and the like merged."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.factors import ALL_OUTLIER, Factor
-from rayfix_service.fusion.kernels import extend_beam
+from rayfix_service.fusion.beam_kernels import multiply_factors
+from rayfix_service.fusion.factors import Factor
 from rayfix_service.fusion.prior import Prior
 
 
@@ -39,7 +40,13 @@ class Hypotheses:
 
 
 def multiply(
-    factors: Sequence[Factor], *, num_clocks: int, max_path_length: float, prior: Prior, width: int
+    factors: Sequence[Factor],
+    *,
+    num_clocks: int,
+    max_path_length: float,
+    prior: Prior,
+    width: int,
+    max_divergence: float,
 ) -> Hypotheses:
     """Find the most probable products of one alternative of each factor.
 
@@ -52,48 +59,36 @@ def multiply(
     prior : Prior
         Of the position.
     width : int
-        Hypotheses that are kept after each factor.
+        Products that are kept after each factor, before those that mean the same are merged.
+    max_divergence : float
+        What such a merge may cost, nats.
     """
     dimension = 3 + num_clocks
-    log_range = float(np.log(max_path_length))
-    information = np.zeros((1, dimension, dimension))
-    eta = np.zeros((1, dimension))
-    information[0, 2, 2], eta[0, 2] = prior.precision, prior.eta
-    log_scale = np.full(1, -num_clocks * log_range - prior.log_volume)
-    chosen = np.zeros((1, len(factors)), np.int8)
-    score = np.zeros(1)
+    log_range = math.log(max_path_length)
     # Few alternatives first: they cut the beam before it meets the many. Which of two alike comes first must not
     # depend on the report's order.
-    for i in sorted(range(len(factors)), key=lambda i: (len(factors[i]), factors[i].log_scale.sum())):
-        factor = factors[i]
-        parent, choice, score = extend_beam(
-            information,
-            eta,
-            log_scale,
-            factor.information,
-            factor.eta,
-            factor.log_scale,
-            width,
-            prior.log_volume,
-            log_range,
-        )
-        information = information[parent] + factor.information[choice]
-        eta = eta[parent] + factor.eta[choice]
-        log_scale = log_scale[parent] + factor.log_scale[choice]
-        chosen = chosen[parent]
-        chosen[:, i] = factor.outlier[choice]
-    placed = (information[:, 0, 0] > 0.0) & (score > -np.inf)
-    information, eta = information[placed], eta[placed]
-    for clock in range(3, dimension):
-        # Of a clock that nothing constrains only this entry is not zero; it changes nothing else.
-        information[information[:, clock, clock] <= 0.0, clock, clock] = 1.0
-    cov = np.linalg.inv(information)
-    cov = 0.5 * (cov + cov.transpose(0, 2, 1))
-    mean = (cov @ eta[:, :, None])[:, :, 0]
+    order = sorted(range(len(factors)), key=lambda i: (len(factors[i]), factors[i].log_scale.sum()))
+    information, eta = np.zeros((1, dimension, dimension)), np.zeros((1, dimension))
+    information[0, 2, 2], eta[0, 2] = prior.precision, prior.eta
+    log_weight, mean, cov, outlier = multiply_factors(
+        information,
+        eta,
+        -num_clocks * log_range - prior.log_volume,
+        np.concatenate([factor.information for factor in factors]),
+        np.concatenate([factor.eta for factor in factors]),
+        np.concatenate([factor.log_scale for factor in factors]),
+        np.concatenate([factor.outlier for factor in factors]),
+        np.cumsum([0, *(len(factor) for factor in factors)]),
+        np.array(order),
+        width,
+        max_divergence,
+        prior.log_volume,
+        log_range,
+    )
     return Hypotheses(
-        log_weight=score[placed],
-        mean=mean[:, :3],
-        cov=cov[:, :3, :3],
-        outlier=chosen[placed],
-        log_lost=sum(float(f.log_scale[f.outlier == ALL_OUTLIER][0]) for f in factors),
+        log_weight=log_weight,
+        mean=mean,
+        cov=cov,
+        outlier=outlier,
+        log_lost=sum(float(factor.log_scale[-1]) for factor in factors),
     )

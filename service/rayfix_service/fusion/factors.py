@@ -10,13 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.clocks import ClockReading
-from rayfix_service.fusion.kernels import condition_on_angle, condition_on_length, to_information
+from rayfix_service.fusion.heard import HeardStation
+from rayfix_service.fusion.kernels import condition_on_length, to_information
 from rayfix_service.fusion.likelihood import Term, product, total_variance
-from rayfix_service.fusion.lookup import Direction, Lookup, look_up
+from rayfix_service.fusion.lookup import Direction
+from rayfix_service.fusion.merging import merge_alternatives
 from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.settings import FusionSettings
-from rayfix_tables.table import StationPart
+
+_RELAXED = math.log(8.0)
+"""Alternatives of a kind that is improbable are merged at up to this many times the divergence (its logarithm)."""
 
 ALL_GOOD, TIME_OUTLIER, ALL_OUTLIER = 0, 1, 2
 """What an alternative takes for an outlier: nothing, the observation's times, or all of it."""
@@ -47,7 +51,7 @@ class Factor:
 
 def make_factor(
     observation: Observation,
-    part: StationPart,
+    station: HeardStation,
     *,
     num_clocks: int,
     max_path_length: float,
@@ -70,7 +74,7 @@ def make_factor(
     timed = bool(observation.lengths or observation.readings)
     parts: list[_Part] = []
     for log_spread, scale in observation.angle_spreads:
-        log_evidence, mean, cov = _condition(look_up(part.levels, _widened(observation.direction, scale)))
+        log_evidence, mean, cov = station.towards(_widened(observation.direction, scale))
         if not len(log_evidence):
             continue
         log_evidence += log_good + log_spread
@@ -85,7 +89,13 @@ def make_factor(
     scores = [p.log_evidence + p.log_clocks + prior.log_gain(p.mean, p.cov) for p in parts]
     top = max(log_outlier + prior.log_volume, *(float(score.max()) for score in scores))
     floor = top + math.log(settings.component_floor)
-    return _alternatives(parts, [np.flatnonzero(score > floor) for score in scores], log_outlier, 3 + num_clocks)
+    keeps = []
+    for part, score in zip(parts, scores, strict=True):
+        # The divergence of all parts together is what counts, though a part may turn out to be the right one.
+        allowed = settings.max_divergence * math.exp(min(top - float(score.max()), _RELAXED))
+        keep = np.flatnonzero(score > floor)
+        keeps.append(merge_alternatives(keep, part.log_evidence, part.mean, part.cov, allowed))
+    return _alternatives(parts, keeps, log_outlier, 3 + num_clocks)
 
 
 class _Part(NamedTuple):
@@ -156,6 +166,20 @@ def _widened(measured: Direction, scale: float) -> Direction:
     return measured if scale == 1.0 else replace(measured, cov=scale**2 * measured.cov)
 
 
+_NO_READINGS = (np.empty(0, np.int64), np.empty(0), np.empty(0))
+
+
+def _columns(
+    readings: tuple[ClockReading, ...],
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Clocks, offsets and variances of readings."""
+    return (
+        np.array([r.clock for r in readings], np.int64),
+        np.array([r.offset for r in readings]),
+        np.array([r.variance for r in readings]),
+    )
+
+
 def _alternatives(
     parts: list[_Part],
     keeps: list[NDArray[np.int64]],
@@ -169,16 +193,13 @@ def _alternatives(
     outlier = np.full(total, ALL_OUTLIER, np.int8)
     begin = 0
     for part, keep in zip(parts, keeps, strict=True):
-        taken = part.readings
         out = slice(begin, begin + len(keep))
         to_information(
             keep,
             part.log_evidence,
             part.mean,
             part.cov,
-            np.array([r.clock for r in taken], np.int64),
-            np.array([r.offset for r in taken], np.float64),
-            np.array([r.variance for r in taken], np.float64),
+            *(_columns(part.readings) if part.readings else _NO_READINGS),
             information[out],
             eta[out],
             log_scale[out],
@@ -186,32 +207,6 @@ def _alternatives(
         outlier[out] = part.kind
         begin = out.stop
     return Factor(information=information, eta=eta, log_scale=log_scale, outlier=outlier)
-
-
-def _condition(lookup: Lookup) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Log evidence, mean and covariance of (x, path length) of every component of the cells looked up."""
-    level = lookup.level
-    begins, ends = level.cell_offsets[lookup.cells], level.cell_offsets[lookup.cells + 1]
-    total = int((ends - begins).sum())
-    log_evidence, mean, cov = np.empty(total), np.empty((total, 4)), np.empty((total, 4, 4))
-    mixture = level.mixture
-    condition_on_angle(
-        mixture.log_weight,
-        mixture.u_mean,
-        mixture.u_cov,
-        mixture.x_mean,
-        mixture.jacobian,
-        mixture.x_cov,
-        begins,
-        ends,
-        lookup.rest_mean,
-        lookup.rest_cov,
-        lookup.log_factor + level.cell_log_mass[lookup.cells],
-        log_evidence,
-        mean,
-        cov,
-    )
-    return log_evidence, mean, cov
 
 
 def _log_angle_range(observation: Observation) -> float:

@@ -275,11 +275,28 @@ def log_integral(
     size = len(eta)
     if information[0, 0] <= 0.0:
         return log_scale + log_volume + (size - 3) * log_range
-    # L D L': below the diagonal of ``work`` is L, above it D L', on it D.
-    total = log_scale
-    square = 0.0
-    det = 1.0
-    for j in range(size):
+    # L D L' of the position, which any factor constrains in all three coordinates or not at all.
+    a00, a10, a20 = information[0, 0], information[1, 0], information[2, 0]
+    l10, l20 = a10 / a00, a20 / a00
+    d1 = information[1, 1] - l10 * a10
+    t21 = information[2, 1] - l20 * a10
+    l21 = t21 / d1 if d1 > 0.0 else 0.0
+    d2 = information[2, 2] - l20 * a20 - l21 * t21
+    if not (d1 > 0.0 and d2 > 0.0):
+        return -np.inf
+    s0 = eta[0]
+    s1 = eta[1] - l10 * s0
+    s2 = eta[2] - l20 * s0 - l21 * s1
+    total = log_scale + 1.5 * LOG_2PI
+    square = s0 * s0 / a00 + s1 * s1 / d1 + s2 * s2 / d2
+    det = a00 * d1 * d2
+    if size > 3:
+        # Below the diagonal of ``work`` is L, above it D L', on it D.
+        work[0, 0], work[1, 1], work[2, 2] = a00, d1, d2
+        work[1, 0], work[2, 0], work[2, 1] = l10, l20, l21
+        work[0, 1], work[0, 2], work[1, 2] = a10, a20, t21
+        solved[0], solved[1], solved[2] = s0, s1, s2
+    for j in range(3, size):
         pivot = information[j, j]
         value = eta[j]
         if pivot <= 0.0:
@@ -332,6 +349,7 @@ def extend_beam(
     factor_eta: Any,
     factor_scale: Any,
     width: Any,
+    hopeless: Any,
     log_volume: Any,
     log_range: Any,
 ) -> Any:
@@ -347,6 +365,8 @@ def extend_beam(
     factor_scale : ndarray of shape (k,)
     width : int
         Products to keep.
+    hopeless : float
+        Products this many nats below the best are given up.
     log_volume, log_range : float
         As in :func:`log_integral`.
 
@@ -372,7 +392,7 @@ def extend_beam(
     least_precision = 4.0 * np.pi * np.exp(-2.0 * log_range)
     peak = np.empty(len(factor_scale))
     for k in range(len(factor_scale)):
-        peak[k] = _log_peak(factor_information[k], factor_eta[k], factor_scale[k])
+        peak[k] = _log_peak(factor_information[k], factor_eta[k], factor_scale[k], work, solved)
         for c in range(3, size):
             if 0.0 < factor_information[k, c, c] < least_precision:
                 peak[k] = np.inf
@@ -381,15 +401,20 @@ def extend_beam(
     score = np.empty(width)
     heap = np.empty(width, np.int64)
     count = 0
+    top = -np.inf
     for h in np.argsort(-own):
         for k in range(len(factor_scale)):
-            if count == width and bound[h] + peak[k] <= score[heap[0]]:
+            most = bound[h] + peak[k]
+            if most < top - hopeless or (count == width and most <= score[heap[0]]):
                 continue
             for i in range(size):
                 linear[i] = eta[h, i] + factor_eta[k, i]
                 for j in range(i + 1):
                     product[i, j] = information[h, i, j] + factor_information[k, i, j]
             value = log_integral(product, linear, log_scale[h] + factor_scale[k], log_volume, log_range, work, solved)
+            if value < top - hopeless:
+                continue
+            top = max(top, value)
             if count < width:
                 parent[count], choice[count], score[count] = h, k, value
                 # Sift up.
@@ -405,15 +430,18 @@ def extend_beam(
                 parent[slot], choice[slot], score[slot] = h, k, value
                 _sift_down(score, heap, count)
     order = np.argsort(-score[:count])
+    while count > 1 and score[order[count - 1]] < score[order[0]] - hopeless:
+        count -= 1
+    order = order[:count]
     return parent[order], choice[order], score[order]
 
 
 @numba.njit(cache=True, nogil=True)
-def _log_peak(information: Any, eta: Any, log_scale: Any) -> Any:
+def _log_peak(information: Any, eta: Any, log_scale: Any, lower: Any, solved: Any) -> Any:
     """Logarithm of a factor's largest value; the state may be constrained in some directions only."""
     size = len(eta)
-    lower = np.zeros((size, size))
-    solved = np.zeros(size)
+    lower[:] = 0.0
+    solved[:] = 0.0
     total = log_scale
     for j in range(size):
         pivot = information[j, j]

@@ -6,8 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.beam import Hypotheses, multiply
+from rayfix_service.fusion.credible import CredibleRegions, posterior_points
 from rayfix_service.fusion.factors import ALL_GOOD, ALL_OUTLIER, Factor, make_factor
+from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.modes import cut_to_free_space, find_modes, unit_points
+from rayfix_service.fusion.normal import normal_points
 from rayfix_service.fusion.observations import Observation, SortedReport, sort_report
 from rayfix_service.fusion.posterior import Posterior, make_posterior
 from rayfix_service.fusion.prior import Prior, even_prior, height_prior
@@ -17,6 +20,9 @@ from rayfix_tables.table import Table
 
 _LEAST_CANDIDATE = 1e-3
 """Candidates less probable than this are not told."""
+
+_REGION_POINTS = 1024
+"""Points that stand for the posterior in credible regions."""
 
 _NO_RAYS = "no ray of station '{}' comes from that direction"
 
@@ -34,7 +40,9 @@ class Locator:
         self.table = table
         self.settings = settings or FusionSettings()
         self._even_prior = even_prior(table.scene.free_space)
+        self._stations = {name: HeardStation(part) for name, part in table.parts.items()}
         self._points = unit_points()
+        self._region_points = normal_points(_REGION_POINTS)
 
     def locate(self, report: Report) -> Fix:
         """Fuse the measurements of a report.
@@ -46,10 +54,10 @@ class Locator:
         """
         observations, unused, _, hypotheses = self._product(report)
         if hypotheses is None:
-            return self._fix(report, "insufficient", (), {}, unused, 0.0)
+            return self._fix(report, "insufficient", (), {}, unused, 0.0, None)
         if not len(hypotheses):
             outlier = _outlier_probabilities(observations, hypotheses.outlier, np.empty(0), 1.0)
-            return self._fix(report, "inconsistent", (), outlier, unused, hypotheses.log_lost)
+            return self._fix(report, "inconsistent", (), outlier, unused, hypotheses.log_lost, None)
         log_weight, mean, cov = cut_to_free_space(
             hypotheses.log_weight, hypotheses.mean, hypotheses.cov, self.table.scene.free_space, self._points
         )
@@ -68,7 +76,15 @@ class Locator:
         half_bad = (hypotheses.outlier == ALL_OUTLIER).mean(axis=1) >= 0.5
         status = self._status(candidates, lost + float(weight[half_bad].sum()))
         outlier = _outlier_probabilities(observations, hypotheses.outlier, weight, lost)
-        return self._fix(report, status, candidates, outlier, unused, log_evidence)
+        regions = CredibleRegions(
+            position=candidates[0].position,
+            covariance=candidates[0].covariance,
+            points=posterior_points(
+                hypotheses.log_weight, hypotheses.mean, hypotheses.cov, self.table.scene.free_space, self._region_points
+            ),
+            share=1.0 - lost,
+        )
+        return self._fix(report, status, candidates, outlier, unused, log_evidence, regions)
 
     def posterior(self, report: Report) -> Posterior:
         """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.
@@ -82,10 +98,12 @@ class Locator:
         return make_posterior(product.hypotheses, product.prior, self.table.scene.free_space)
 
     def warm_up(self) -> None:
-        """Compile the kernels by locating a report of each kind."""
+        """Compile the kernels and prepare reports without angles, by locating a report of each kind."""
         for station in self.table.site.stations:
             angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=0.02, zenith_stdev=0.02)
-            self.locate(Report(measurements=(angle, Range(station_id=station.id, path_length=5.0, stdev=0.5))))
+            length = Range(station_id=station.id, path_length=5.0, stdev=0.5)
+            self.locate(Report(measurements=(angle, length)))
+            self.locate(Report(measurements=(length,)))
 
     def _product(self, report: Report) -> "_Product":
         """Multiply what the measurements say."""
@@ -102,6 +120,7 @@ class Locator:
                 max_path_length=self.table.site.max_path_length,
                 prior=prior,
                 width=self.settings.beam_width,
+                max_divergence=self.settings.max_divergence,
             )
         return _Product(observations, unused, prior, hypotheses)
 
@@ -113,7 +132,7 @@ class Locator:
         for observation in sorted_report.observations:
             factor = make_factor(
                 observation,
-                self.table.parts[observation.station_id],
+                self._stations[observation.station_id],
                 num_clocks=sorted_report.num_clocks,
                 max_path_length=self.table.site.max_path_length,
                 prior=prior,
@@ -146,6 +165,7 @@ class Locator:
         outlier: dict[int, float],
         unused: dict[int, str],
         log_evidence: float,
+        regions: CredibleRegions | None,
     ) -> Fix:
         outcomes = tuple(
             Outcome(used=False, reason=unused[i])
@@ -158,6 +178,8 @@ class Locator:
             candidates=candidates,
             outcomes=outcomes,
             log_evidence=log_evidence,
+            regions=regions,
+            confidence=report.confidence,
             table_id=self.table.table_id,
             target_id=report.target_id,
             timestamp=report.timestamp,

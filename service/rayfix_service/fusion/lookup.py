@@ -14,6 +14,7 @@ What the factor approximates is the density of the measured angle per steradian 
 radian when one was, and 1 when none was.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,14 @@ _MERIDIAN_WINDOW = float(np.deg2rad(4.0))
 """Narrower windows are not summed along a tilted meridian, which is straight enough over these."""
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+SUM_RATIO = 1.6
+"""Noise up to this many times what a window serves is looked up in the sum of some ten cells.
+
+A cell of the next window is merged for noise of its own size: for hardly more noise than this window serves, its
+components are too wide.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,34 +95,39 @@ class Lookup:
 
 
 def look_up(levels: tuple[Level, ...], measured: Direction) -> Lookup:
-    """Look a direction up in the finest level whose window holds its noise.
+    """Look a direction up in the finest level whose window holds its noise, or in cells of it around that hold it.
 
     Parameters
     ----------
     levels : tuple of Level
         Finest first.
     """
+    summed = levels[-1]
     if measured.azimuth is not None and measured.zenith is not None:
+        (var_azimuth, covariance), (_, var_zenith) = measured.cov.tolist()
         for level in levels:
-            cell = int(level.grid.nearest(measured.azimuth, measured.zenith))
-            azimuth, zenith = level.grid.centres[cell].tolist()
-            sine = float(np.sin(zenith))
+            cell, azimuth, zenith = level.grid.cell_around(measured.azimuth, measured.zenith)
+            sine = math.sin(zenith)
             # The noise in the cell's tangent plane.
-            hh, hv, vv = measured.cov[0, 0] * sine**2, measured.cov[0, 1] * sine, measured.cov[1, 1]
-            if 0.5 * (hh + vv) + np.hypot(0.5 * (hh - vv), hv) <= _limit(level):
-                offset = (sine * float(wrap(measured.azimuth - azimuth)), measured.zenith - zenith)
+            hh, hv, vv = var_azimuth * sine**2, covariance * sine, var_zenith
+            largest = 0.5 * (hh + vv) + math.hypot(0.5 * (hh - vv), hv)
+            if largest <= _limit(level):
+                turn = math.remainder(measured.azimuth - azimuth, 2.0 * math.pi)
+                offset = (sine * turn, measured.zenith - zenith)
                 return _single_cell(level, cell, offset, (hh, hv, vv))
+            if largest <= SUM_RATIO**2 * _limit(level):
+                summed = level
+                break
         correlation = measured.cov[0, 1] / np.sqrt(measured.cov[0, 0] * measured.cov[1, 1])
         if abs(correlation) > _LEAST_CORRELATION:
-            level = levels[-1]
-            ellipse = sum_of_ellipse(level.grid, level.window, measured.azimuth, measured.zenith, measured.cov)
-            return Lookup(level=level, **ellipse._asdict())
+            ellipse = sum_of_ellipse(summed.grid, summed.window, measured.azimuth, measured.zenith, measured.cov)
+            return Lookup(level=summed, **ellipse._asdict())
     elif measured.azimuth is not None and measured.tilt is not None:
         stdev = float(np.sqrt(measured.cov[0, 0]))
         level = next((level for level in levels if level.window >= max(_MERIDIAN_WINDOW, stdev)), levels[-1])
         meridian = sum_of_meridian(level.grid, level.window, measured.azimuth, stdev, measured.tilt)
         return Lookup(level=level, **meridian._asdict())
-    return _cell_sum(levels[-1], measured)
+    return _cell_sum(summed, measured)
 
 
 def _limit(level: Level) -> float:
@@ -132,7 +146,7 @@ def _single_cell(level: Level, cell: int, offset: tuple[float, float], noise: tu
     g_h, g_v = (d_vv * a_h + hv * a_v) / det, (hv * a_h + d_hh * a_v) / det
     scale = window / det
     rest = [(d_vv * hh + hv * hv) * scale, window * hv * scale, (d_hh * vv + hv * hv) * scale]
-    log_factor = _LOG_2PI + 2.0 * np.log(window) - 0.5 * np.log(det) + 0.5 * (a_h * g_h + a_v * g_v)
+    log_factor = _LOG_2PI + 2.0 * math.log(window) - 0.5 * math.log(det) + 0.5 * (a_h * g_h + a_v * g_v)
     return Lookup(
         level=level,
         cells=np.array([cell]),

@@ -7,13 +7,12 @@ the prior. Nothing is approximated but the share of each Gaussian that is free, 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
-from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rayfix_service.fusion.beam import Hypotheses
+from rayfix_service.fusion.normal import normal_points
 from rayfix_service.fusion.prior import Prior
 from rayfix_tables.freespace import FreeSpace
 
@@ -130,14 +129,18 @@ class Posterior:
         middle, stdev = self.prior.eta / self.prior.precision, self.prior.precision**-0.5
         low = max(space.origin[2], middle - _HEIGHT_REACH * stdev)
         high = min(space.origin[2] + space.voxel_size * space.free.shape[2], middle + _HEIGHT_REACH * stdev)
-        edges = np.linspace(low, high, _HEIGHT_BINS + 1)
-        centre = 0.5 * (edges[1:] + edges[:-1])
+        # No bin reaches from one layer of voxels into the next, where another part of the plane is free.
+        layers = space.origin[2] + space.voxel_size * np.arange(space.free.shape[2] + 1)
+        edges = np.unique(
+            np.concatenate([np.linspace(low, high, _HEIGHT_BINS + 1), layers[(layers > low) & (layers < high)]])
+        )
+        centre, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
         layer = np.clip(((centre - space.origin[2]) / space.voxel_size).astype(np.int64), 0, space.free.shape[2] - 1)
         square = ((centre - middle) / stdev) ** 2
-        weight = np.exp(-0.5 * (square - square.min())) * np.count_nonzero(space.free, axis=(0, 1))[layer]
-        bins = rng.choice(_HEIGHT_BINS, count, p=weight / weight.sum())
+        weight = width * np.exp(-0.5 * (square - square.min())) * np.count_nonzero(space.free, axis=(0, 1))[layer]
+        bins = rng.choice(len(weight), count, p=weight / weight.sum())
         places = np.empty((count, 3))
-        places[:, 2] = edges[bins] + (edges[1] - edges[0]) * rng.random(count)
+        places[:, 2] = edges[bins] + width[bins] * rng.random(count)
         for number in np.unique(layer[bins]):
             mine = np.flatnonzero(layer[bins] == number)
             columns = np.argwhere(space.free[:, :, number])
@@ -181,23 +184,10 @@ def free_shares(mean: Array, cov: Array, free_space: FreeSpace) -> Array:
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
     """
-    points = _normal_points()
+    points = normal_points(_NUM_POINTS)
     return np.array(
         [
             free_space.contains(centre + points @ root.T).mean()
             for centre, root in zip(mean, np.linalg.cholesky(cov), strict=True)
         ]
     )
-
-
-@cache
-def _normal_points() -> Array:
-    """Points that stand for a standard normal in three dimensions, shape (n, 3).
-
-    An additive recurrence on the generalised golden ratio, which fills the unit cube more evenly than chance, and the
-    normal's quantiles of it.
-    """
-    ratio = 1.2207440846057596
-    uniform = (0.5 + np.arange(1, _NUM_POINTS + 1)[:, None] * ratio ** -np.arange(1.0, 4.0)) % 1.0
-    quantile = NormalDist().inv_cdf
-    return np.array([[quantile(value) for value in row] for row in uniform.tolist()])

@@ -214,6 +214,23 @@ def cut_gaussian(mean: Array, cov: Array, points: Array, free_space: FreeSpace) 
     return cut_mean, cov, share
 
 
+def posterior_points(log_weight: Array, mean: Array, cov: Array, free_space: FreeSpace, normal_points: Array) -> Array:
+    """Points of a mixture of Gaussians cut to the free space.
+
+    The n-th normal point is of the Gaussian whose stretch of the summed weights holds (n + 1/2) / count. One with a
+    singular covariance leaves its points to the next one.
+    """
+    weight = np.exp(log_weight - log_weight.max())
+    proper = np.linalg.eigvalsh(cov)[:, 0] > 0.0
+    place = (np.arange(len(normal_points)) + 0.5) / len(normal_points)
+    places = np.empty_like(normal_points)
+    ends = np.cumsum(weight / weight.sum())
+    for n, point in enumerate(normal_points):
+        owner = next(h for h in range(len(ends)) if proper[h] and (place[n] <= ends[h] or h == len(ends) - 1))
+        places[n] = mean[owner] + np.linalg.cholesky(cov[owner]) @ point
+    return places[free_space.contains(places)]
+
+
 def climb(log_density: Array, mean: Array, precision: Array, start: Array) -> tuple[Array, Array]:
     """Climb to a mode of a Gaussian mixture by the fixed point of its stationarity condition.
 

@@ -9,6 +9,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_service.fusion.credible import CredibleRegions
+
+CONFIDENCE = 0.68
+"""Probability with which accuracies hold where a report does not say it."""
+
 Frame = Literal["scene", "lcs", "north"]
 """Frame of an angle: the scene's, the station's local one, or the scene's turned to geographic north."""
 
@@ -133,10 +138,17 @@ Measurement = Angle | Range | LogRange | TimeOfArrival | TimeDifference
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """The measurements of one transmission, and what is known of the UE's height besides."""
+    """The measurements of one transmission, and what is known of the UE's height besides.
+
+    Attributes
+    ----------
+    confidence : float
+        Probability with which the accuracies that other systems are told are to hold, between 0 and 1.
+    """
 
     measurements: tuple[Measurement, ...]
     height: Height | None = None
+    confidence: float = CONFIDENCE
     target_id: str | None = None
     timestamp: str | None = None
 
@@ -191,6 +203,10 @@ class Fix:
         One per measurement of the report, in its order.
     log_evidence : float
         Natural logarithm of the probability density of the report, for comparing reports.
+    regions : CredibleRegions or None
+        Regions around the position that hold the UE with any probability; None where there is no position.
+    confidence : float
+        Probability that the report wants regions of.
     """
 
     status: Status
@@ -198,6 +214,8 @@ class Fix:
     outcomes: tuple[Outcome, ...]
     log_evidence: float
     table_id: str
+    regions: CredibleRegions | None = None
+    confidence: float = CONFIDENCE
     target_id: str | None = None
     timestamp: str | None = None
 

@@ -12,7 +12,9 @@ class FusionSettings:
     outlier_probability : float
         Prior probability that a measurement has nothing to do with the position.
     beam_width : int
-        Hypotheses that are kept from one station to the next.
+        Hypotheses that are kept from one station to the next, before the like are merged.
+    max_divergence : float
+        What merging two hypotheses may cost, nats.
     component_floor : float
         Components of a station whose share of its evidence is below this are left out. Since weights are
         probabilities, so is what this can lose.
@@ -24,15 +26,13 @@ class FusionSettings:
         An ambiguous fix of which not even this many candidates together are that probable is ``insufficient``.
     insufficient_above : float, m
         A best candidate whose largest standard deviation is above this makes the fix ``insufficient``.
-    confidence : float
-        Probability that the reported ellipsoids and accuracies hold.
     """
 
     outlier_probability: float = 0.01
-    beam_width: int = 256
+    beam_width: int = 2048
+    max_divergence: float = 5e-3
     component_floor: float = 1e-6
     hypothesis_floor: float = 1e-5
     ambiguous_below: float = 0.7
     most_rivals: int = 3
     insufficient_above: float = 3.0
-    confidence: float = 0.68

@@ -132,6 +132,7 @@ FIX_EXAMPLE: dict[str, Any] = {
     "covariance_m2": _COVARIANCE,
     "horizontal_accuracy_m": 0.48,
     "vertical_accuracy_m": 0.15,
+    "ellipsoid_semi_axes_m": [[-0.748, -0.439, 0.092], [-0.041, 0.12, 0.24], [-0.13, 0.196, -0.12]],
     "confidence": 0.68,
     "candidates": [
         {"probability": 0.986, "position": _POSITION, "covariance_m2": _COVARIANCE},
@@ -302,7 +303,7 @@ LOCAL_3D_EXAMPLE: dict[str, Any] = {
     "localOrigin": {"coordinateId": "hall", "horizAxesOrientation": 0},
     "point": _POSITION,
     "uncertaintyEllipsoid": {"semiMajor": 0.86, "semiMinor": 0.27, "vertical": 0.28, "orientationMajor": 60},
-    "confidence": 67,
+    "confidence": 68,
 }
 """An answer with ``output=3gpp``."""
 

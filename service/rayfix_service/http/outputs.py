@@ -95,7 +95,9 @@ class OmloxLocation(BaseModel):
     provider_id: str = Field(description="the target_id")
     timestamp_generated: str | None = None
     crs: Literal["local"]
-    accuracy: float = Field(description="horizontal accuracy with a probability of 0.68, m")
+    accuracy: float = Field(
+        description="horizontal accuracy, m: the radius that holds the target with the `confidence` of the report"
+    )
     floor: float
     elevation_ref: Literal["floor"]
     properties: dict[str, Any]

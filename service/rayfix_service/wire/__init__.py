@@ -20,16 +20,12 @@ from rayfix_service.wire.problems import (
 )
 from rayfix_service.wire.request import parse_report, read_json
 from rayfix_service.wire.response import (
-    CONFIDENCE,
     FixDocument,
     Point,
     fix_to_document,
-    horizontal_accuracy,
-    vertical_accuracy,
 )
 
 __all__ = [
-    "CONFIDENCE",
     "MAX_MEASUREMENTS",
     "MAX_REPORTS",
     "METRES_PER_NANOSECOND",
@@ -42,10 +38,8 @@ __all__ = [
     "ReportDocument",
     "WireModel",
     "fix_to_document",
-    "horizontal_accuracy",
     "parse_report",
     "path_text",
     "problems_of",
     "read_json",
-    "vertical_accuracy",
 ]

@@ -2,8 +2,8 @@
 
 from pydantic import ConfigDict, Field
 
-from rayfix_service.fusion.report import Height
-from rayfix_service.wire.fields import HeightM, HeightStdevM, Rfc3339, WireModel
+from rayfix_service.fusion.report import CONFIDENCE, Height
+from rayfix_service.wire.fields import Confidence, HeightM, HeightStdevM, Rfc3339, WireModel
 from rayfix_service.wire.measurements import MeasurementDocument
 
 MAX_MEASUREMENTS = 256
@@ -45,6 +45,7 @@ class ReportDocument(WireModel):
     height: HeightDocument | None = Field(
         default=None, description='an object such as {"z_m": 1.2, "stdev_m": 0.1}: the known height of the target'
     )
+    confidence: Confidence = CONFIDENCE
     measurements: list[MeasurementDocument] = Field(
         strict=False,  # a tuple is as good, where the document comes from Python
         min_length=1,

@@ -105,5 +105,10 @@ PathLossExponent = Annotated[float, _number(0.5, 10, "a path-loss exponent")]
 HeightM = Annotated[float, _number(-1e4, 1e4, "a height in metres, z in the scene frame")]
 HeightStdevM = Annotated[float, _number(1e-3, 1e4, "a positive standard deviation in metres")]
 
+# Of some thousand points that stand for a posterior, ten are beyond 99 %.
+Confidence = Annotated[
+    float, _number(0.01, 0.99, "the probability with which the accuracies of the answer are to hold")
+]
+
 TailShare = Annotated[float, _number(1e-3, 0.5, "the share of errors that are of the wide part")]
 TailScale = Annotated[float, _number(1.5, 20, "how many times wider the wide part is")]

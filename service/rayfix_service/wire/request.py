@@ -55,6 +55,7 @@ def parse_report(document: Mapping[str, Any] | bytes) -> Report:
     return Report(
         measurements=tuple(m.measurement() for m in model.measurements),
         height=None if model.height is None else model.height.height(),
+        confidence=model.confidence,
         target_id=model.target_id,
         timestamp=model.timestamp,
     )

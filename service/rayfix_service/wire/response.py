@@ -1,7 +1,5 @@
 """From a fix to its JSON."""
 
-import math
-from statistics import NormalDist
 from typing import Annotated, Any
 
 import numpy as np
@@ -9,12 +7,6 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from rayfix_service.fusion.report import Fix, Status
-
-CONFIDENCE = 0.68
-"""Probability that the accuracy figures of a fix hold."""
-
-# Midpoints: the trapezoidal rule of a periodic function, kept away from g = 0 of a degenerate Gaussian.
-_COS_TWO_PHI = np.cos((np.arange(256) + 0.5) * (np.pi / 256))
 
 
 class Point(BaseModel):
@@ -62,57 +54,22 @@ class FixDocument(BaseModel):
     position: Point | None = Field(description="most probable position, null when no measurement could be used")
     covariance_m2: _Matrix | None = Field(description="covariance of that position, m2")
     horizontal_accuracy_m: float | None = Field(
-        description="radius of the horizontal circle around the position that holds the target with "
-        "probability `confidence`, given that this candidate is the right one"
+        description="radius of the horizontal circle around the position that holds the target with probability "
+        "`confidence`, wherever it is: where the position is less probable, the circle reaches to its rivals"
     )
     vertical_accuracy_m: float | None = Field(description="half the height of the layer that does, likewise")
-    confidence: float = Field(description="probability that each of the two accuracies holds")
+    ellipsoid_semi_axes_m: _Matrix | None = Field(
+        description="an ellipsoid around the position that does, likewise: vectors x, y, z from its centre to the ends "
+        "of its axes, longest first"
+    )
+    confidence: float = Field(
+        description="probability that each of circle, layer and ellipsoid holds the target: that of the report, less "
+        "where all measurements may be outliers"
+    )
     candidates: list[CandidateDocument] = Field(description="the position and its rivals, most probable first")
     measurements: list[OutcomeDocument]
     table_id: str
     compute_ms: float = Field(description="time the fix itself took, ms")
-
-
-def horizontal_accuracy(covariance: NDArray[np.float64], confidence: float = CONFIDENCE) -> float:
-    """Radius of the circle around the mean that holds `confidence` of a Gaussian's horizontal marginal.
-
-    In polar coordinates of the whitened plane the probability outside radius r is the mean over the angle phi
-    of exp(-r^2 / (2 g)), g = l1 cos^2 phi + l2 sin^2 phi with the eigenvalues l1 >= l2. Newton's method
-    solves it for r^2; the result is exact to about 1e-9 of the radius.
-
-    Parameters
-    ----------
-    covariance : ndarray of shape (3, 3), m2
-        Covariance of the position; only its upper left 2 x 2 block counts.
-    confidence : float
-        Probability inside the circle, between 0 and 1.
-
-    Returns
-    -------
-    float
-        The radius, m.
-    """
-    (xx, xy), (_, yy) = covariance[:2, :2].tolist()
-    mean, half_gap = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
-    largest = mean + half_gap
-    if largest <= 0.0:
-        return 0.0
-    ratio = max(0.0, (mean - half_gap) / largest)
-    spread = 2 * ((1 + ratio) / 2 + (1 - ratio) / 2 * _COS_TWO_PHI)  # 2 g, where l1 is 1
-    # The function of r^2 is convex and falls, so that Newton's steps from below never overshoot.
-    squared = NormalDist().inv_cdf((1 + confidence) / 2) ** 2
-    for _ in range(50):
-        outside = np.exp(-squared / spread)
-        step = float((outside.mean() - (1 - confidence)) / (outside / spread).mean())
-        squared += step
-        if step <= 1e-12 * squared:
-            break
-    return math.sqrt(largest * squared)
-
-
-def vertical_accuracy(covariance: NDArray[np.float64], confidence: float = CONFIDENCE) -> float:
-    """Half-width, m, of the interval around the mean that holds `confidence` of the vertical marginal."""
-    return NormalDist().inv_cdf((1 + confidence) / 2) * math.sqrt(max(0.0, float(covariance[2, 2])))
 
 
 def fix_to_document(fix: Fix, compute_seconds: float) -> dict[str, Any]:
@@ -136,16 +93,17 @@ def fix_to_document(fix: Fix, compute_seconds: float) -> dict[str, Any]:
         for candidate in fix.candidates
     ]
     best = candidates[0] if candidates else {"position": None, "covariance_m2": None}
-    covariance = fix.covariance
+    regions, confidence = fix.regions, fix.confidence
     return {
         "target_id": fix.target_id,
         "timestamp": fix.timestamp,
         "status": fix.status,
         "position": best["position"],
         "covariance_m2": best["covariance_m2"],
-        "horizontal_accuracy_m": None if covariance is None else horizontal_accuracy(covariance),
-        "vertical_accuracy_m": None if covariance is None else vertical_accuracy(covariance),
-        "confidence": CONFIDENCE,
+        "horizontal_accuracy_m": None if regions is None else regions.horizontal_radius(confidence),
+        "vertical_accuracy_m": None if regions is None else regions.vertical_half_height(confidence),
+        "ellipsoid_semi_axes_m": None if regions is None else regions.ellipsoid(confidence).semi_axes.tolist(),
+        "confidence": confidence if regions is None else min(confidence, regions.share),
         "candidates": candidates,
         "measurements": [
             {"index": index, "used": True, "outlier_probability": outcome.outlier_probability}

@@ -15,6 +15,7 @@ from rayfix.evaluation.paper.points import Launcher, RayPoints, draw_directions,
 from rayfix.evaluation.paper.selection import RelativeLength, select_by_length
 from rayfix_service.fusion import beam
 from rayfix_service.fusion.factors import make_factor
+from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.lookup import NO_DIRECTION, Direction
 from rayfix_service.fusion.observations import sort_report
 from rayfix_service.fusion.prior import Prior
@@ -58,11 +59,17 @@ def closed_form(table: Table, *measurements: Measurement) -> tuple[Array, Array]
     limits = {"max_path_length": table.site.max_path_length, "prior": Prior(log_volume=float(np.log(60.0)))}
     factors = []
     for observation in sorted_report.observations:
-        part = table.parts[observation.station_id]
-        factor = make_factor(observation, part, num_clocks=sorted_report.num_clocks, settings=NO_OUTLIERS, **limits)
+        station = HeardStation(table.parts[observation.station_id])
+        factor = make_factor(observation, station, num_clocks=sorted_report.num_clocks, settings=NO_OUTLIERS, **limits)
         assert factor is not None
         factors.append(factor)
-    found = beam.multiply(factors, num_clocks=sorted_report.num_clocks, width=NO_OUTLIERS.beam_width, **limits)
+    found = beam.multiply(
+        factors,
+        num_clocks=sorted_report.num_clocks,
+        width=NO_OUTLIERS.beam_width,
+        max_divergence=NO_OUTLIERS.max_divergence,
+        **limits,
+    )
     return Mixture(log_weight=found.log_weight, mean=found.mean, cov=found.cov).moments()
 
 

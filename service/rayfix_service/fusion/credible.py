@@ -1,0 +1,190 @@
+"""Credible regions: ellipsoids, circles and layers around a position that hold the UE with a stated probability.
+
+The posterior has several hills and is cut to the free space, so no covariance tells how far a region must reach. Points
+drawn evenly from the whole posterior do: the region of probability p is as large as it takes to hold a share p of them.
+Where the best candidate is less probable than p, the region reaches to its rivals.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.kernels import cholesky
+from rayfix_tables.freespace import FreeSpace
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ellipsoid:
+    """All x with ``(x - centre) . shape^-1 (x - centre) <= 1``.
+
+    Attributes
+    ----------
+    centre : ndarray of shape (3,), m
+    shape : ndarray of shape (3, 3), m2
+    probability : float
+        That the UE lies in it: as asked for, but never more than the share of the regions that it is one of.
+    """
+
+    centre: NDArray[np.float64]
+    shape: NDArray[np.float64]
+    probability: float
+
+    def holds(self, point: NDArray[np.float64]) -> bool:
+        """Whether a point of shape (3,), m, lies in it."""
+        apart = point - self.centre
+        return bool(apart @ np.linalg.solve(self.shape, apart) <= 1.0)
+
+    @property
+    def semi_axes(self) -> NDArray[np.float64]:
+        """Vectors from the centre to the ends of the axes, longest first, as rows, shape (3, 3), m."""
+        squares, axes = np.linalg.eigh(self.shape)
+        return np.asarray((axes * np.sqrt(np.maximum(squares, 0.0))).T[::-1])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CredibleRegions:
+    """Regions around a position.
+
+    Attributes
+    ----------
+    position : ndarray of shape (3,), m
+    covariance : ndarray of shape (3, 3), m2
+        Of the best candidate.
+    points : ndarray of shape (n, 3), m
+        Stand for the posterior, all alike.
+    share : float
+        Probability that the UE is where the points are. If all measurements are outliers it is anywhere, and no region
+        is credible beyond this share.
+    """
+
+    position: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    points: NDArray[np.float64]
+    share: float
+
+    def ellipsoid(self, probability: float) -> Ellipsoid:
+        """Ellipsoid that holds the UE with a probability.
+
+        It has the shape of the best candidate's covariance or of the whole posterior's, whichever makes it smaller.
+        """
+        apart = self.points - self.position
+        whole = apart.T @ apart / len(apart) + 1e-9 * self.covariance
+        return min((self._scaled(shape, probability) for shape in (self.covariance, whole)), key=_volume)
+
+    def upright_ellipsoid(self, probability: float) -> Ellipsoid:
+        """Ellipsoid with one axis vertical that holds the UE with a probability."""
+        upright = self.covariance.copy()
+        upright[2, :2] = upright[:2, 2] = 0.0
+        return self._scaled(upright, probability)
+
+    def horizontal_radius(self, probability: float) -> float:
+        """Radius, m, of the horizontal circle that holds the UE with a probability."""
+        apart = self.points[:, :2] - self.position[:2]
+        return math.sqrt(self._quantile(np.einsum("ni,ni->n", apart, apart), probability))
+
+    def vertical_half_height(self, probability: float) -> float:
+        """Half the height, m, of the layer that holds the UE with a probability."""
+        return self._quantile(np.abs(self.points[:, 2] - self.position[2]), probability)
+
+    def _scaled(self, shape: NDArray[np.float64], probability: float) -> Ellipsoid:
+        apart = self.points - self.position
+        squares = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(shape), apart)
+        radius = self._quantile(squares, probability)
+        return Ellipsoid(
+            centre=self.position, shape=max(radius, 1e-12) * shape, probability=min(probability, self.share)
+        )
+
+    def _quantile(self, values: NDArray[np.float64], probability: float) -> float:
+        """Least of the points' values up to which they are as probable; the largest where they are not."""
+        count = math.ceil(min(1.0, probability / max(self.share, 1e-9)) * len(values))
+        place = max(count, 1) - 1
+        return float(np.partition(values, place)[place])
+
+
+def _volume(ellipsoid: Ellipsoid) -> float:
+    return float(np.linalg.det(ellipsoid.shape))
+
+
+def posterior_points(
+    log_weight: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    cov: NDArray[np.float64],
+    free_space: FreeSpace,
+    normal_points: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Points that stand for a mixture of Gaussians cut to the free space.
+
+    Each Gaussian gets a share of the points as its weight is (systematic resampling); those in solids are left out.
+
+    Parameters
+    ----------
+    log_weight : ndarray of shape (h,)
+        Of the Gaussians before they are cut.
+    mean : ndarray of shape (h, 3), m
+    cov : ndarray of shape (h, 3, 3), m2
+    normal_points : ndarray of shape (n, 3)
+        Fill a standard normal evenly, and so does any run of them.
+
+    Returns
+    -------
+    ndarray of shape (m, 3), m
+        All n of them when none is in the free space.
+    """
+    places = np.empty_like(normal_points)
+    weight = np.exp(log_weight - log_weight.max())
+    count = _spread(
+        weight / weight.sum(),
+        mean,
+        cov,
+        free_space.origin,
+        free_space.voxel_size,
+        free_space.free,
+        normal_points,
+        places,
+    )
+    return places[:count] if count else _all_points(mean[0], cov[0], normal_points)
+
+
+def _all_points(
+    mean: NDArray[np.float64], cov: NDArray[np.float64], normal_points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    return np.asarray(mean + normal_points @ np.linalg.cholesky(cov).T)
+
+
+@numba.njit(cache=True, nogil=True)
+def _spread(
+    weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any, normal_points: Any, places: Any
+) -> Any:
+    """Fill ``places`` and tell how many there are."""
+    nx, ny, nz = free.shape
+    lower = np.zeros((3, 3))
+    place = np.empty(3)
+    voxel = np.empty(3, np.int64)
+    total = len(normal_points)
+    count = 0
+    drawn = 0
+    reached = 0.0
+    for h in range(len(weight)):
+        reached += weight[h]
+        last = h == len(weight) - 1
+        if drawn >= total or (not last and (drawn + 0.5) / total > reached):
+            continue
+        if not cholesky(cov[h], lower):
+            continue
+        while drawn < total and (last or (drawn + 0.5) / total <= reached):
+            for i in range(3):
+                place[i] = mean[h, i]
+                for j in range(i + 1):
+                    place[i] += lower[i, j] * normal_points[drawn, j]
+                voxel[i] = int(np.floor((place[i] - origin[i]) / voxel_size))
+            drawn += 1
+            if not (0 <= voxel[0] < nx and 0 <= voxel[1] < ny and 0 <= voxel[2] < nz):
+                continue
+            if free[voxel[0], voxel[1], voxel[2]]:
+                places[count] = place
+                count += 1
+    return count

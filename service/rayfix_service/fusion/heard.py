@@ -1,0 +1,90 @@
+"""What a station's part of the table says of a measured direction, as Gaussians over (position, path length)."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.kernels import condition_on_angle
+from rayfix_service.fusion.lookup import NO_DIRECTION, Direction, Lookup, look_up
+from rayfix_service.fusion.merging import merge_alternatives
+from rayfix_tables.table import StationPart
+
+_RANGE_STDEV = 0.1
+"""Noise of path lengths, m, under which paths of all directions are told apart."""
+
+_MAX_DIVERGENCE = 1e-4
+"""What merging two of them may cost, nats: a path length picks a small part of them all."""
+
+
+class Heard(NamedTuple):
+    """Weighted Gaussians over (x, path length).
+
+    Attributes
+    ----------
+    log_evidence : ndarray of shape (k,)
+    mean : ndarray of shape (k, 4), m
+    cov : ndarray of shape (k, 4, 4), m2
+    """
+
+    log_evidence: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    cov: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return len(self.log_evidence)
+
+    def copy(self) -> "Heard":
+        """Return arrays that may be overwritten."""
+        return Heard(*(array.copy() for array in self))
+
+
+@dataclass(frozen=True)
+class HeardStation:
+    """A station's part of the table, and what follows from it for reports without an angle."""
+
+    part: StationPart
+
+    def towards(self, measured: Direction) -> Heard:
+        """Gaussians of the paths from a measured direction; none where no ray comes. They may be overwritten."""
+        if measured.azimuth is None and measured.zenith is None:
+            return self.everywhere.copy()
+        return _condition(look_up(self.part.levels, measured))
+
+    @cached_property
+    def everywhere(self) -> Heard:
+        """Gaussians of the paths of all directions, those merged that no path length tells apart."""
+        heard = _condition(look_up(self.part.levels, NO_DIRECTION))
+        if not len(heard):
+            return heard
+        left = merge_alternatives(
+            np.arange(len(heard)), *heard, _MAX_DIVERGENCE, noise=np.array([0.0, 0.0, 0.0, _RANGE_STDEV**2])
+        )
+        return Heard(*(array[left] for array in heard))
+
+
+def _condition(lookup: Lookup) -> Heard:
+    """Condition every component of the cells looked up on the rest of the measured angle."""
+    level = lookup.level
+    begins, ends = level.cell_offsets[lookup.cells], level.cell_offsets[lookup.cells + 1]
+    total = int((ends - begins).sum())
+    heard = Heard(np.empty(total), np.empty((total, 4)), np.empty((total, 4, 4)))
+    mixture = level.mixture
+    condition_on_angle(
+        mixture.log_weight,
+        mixture.u_mean,
+        mixture.u_cov,
+        mixture.x_mean,
+        mixture.jacobian,
+        mixture.x_cov,
+        begins,
+        ends,
+        lookup.rest_mean,
+        lookup.rest_cov,
+        lookup.log_factor + level.cell_log_mass[lookup.cells],
+        *heard,
+    )
+    return heard
