@@ -28,7 +28,14 @@ __all__ = [
 ]
 
 
-def build(site_path: str | Path, table_path: str | Path | None = None, *, jobs: int = -1) -> Table:
+def build(
+    site_path: str | Path,
+    table_path: str | Path | None = None,
+    *,
+    jobs: int = -1,
+    former: str | Path | None = None,
+    tolerance: float = 0.0,
+) -> Table:
     """Build a site's table and open it.
 
     Parameters
@@ -39,6 +46,11 @@ def build(site_path: str | Path, table_path: str | Path | None = None, *, jobs: 
         Where the table goes; beside the site file, with the suffix ``.h5``, when left out.
     jobs : int
         Cells that are fitted at a time; -1 for one per core.
+    former : str or Path, optional
+        Table from which whatever still holds is taken; one at ``table_path`` when left out.
+    tolerance : float
+        Share of a cell's mass, 0 or more and below 1, that may have changed before a cell of the former table is fitted
+        again. With 0, the table is that of a whole build.
 
     Raises
     ------
@@ -48,7 +60,7 @@ def build(site_path: str | Path, table_path: str | Path | None = None, *, jobs: 
         from rayfix_offline.build import build_table
 
     table_path = Path(table_path) if table_path is not None else Path(site_path).with_suffix(".h5")
-    build_table(site_path, table_path, jobs=jobs)
+    build_table(site_path, table_path, jobs=jobs, former=former, tolerance=tolerance)
     return Table.open(table_path)
 
 

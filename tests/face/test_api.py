@@ -12,6 +12,7 @@ import pytest
 import rayfix
 from rayfix.example.drop import example_paths, report_text, simulate_example_report
 from rayfix.example.files import example_report
+from rayfix.example.hall import hall_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -49,6 +50,27 @@ def test_build_writes_beside_the_site_file(hall_site_path: Path, tmp_path: Path)
     assert table.path == tmp_path / "site.h5"
     table.verify()
     assert [round(float(np.rad2deg(level.window)), 6) for level in table.levels("bs1")] == [15.0]
+
+
+def test_build_takes_over_from_a_former_table(hall_site_path: Path, tmp_path: Path) -> None:
+    """A cabinet has moved by a centimetre; within the tolerance cells of the former table are kept."""
+    text = hall_site_path.read_text(encoding="utf-8").replace("[2.5, 10]", "[15.0]")
+    (tmp_path / "site.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "hall.glb").write_bytes((hall_site_path.parent / "hall.glb").read_bytes())
+    former = rayfix.build(tmp_path / "site.toml", tmp_path / "former.h5")
+    scene = hall_scene()
+    scene.geometry["cabinet_1"].apply_translation((0.0, 0.01, 0.0))
+    (tmp_path / "hall.glb").write_bytes(scene.export(file_type="glb"))
+    table = rayfix.build(tmp_path / "site.toml", tmp_path / "new.h5", former=former.path, tolerance=0.5)
+    updates = [part.update for part in table.parts.values() if part.update is not None]
+    assert updates
+    for update in updates:
+        assert update.tolerance == 0.5
+        assert update.former_part_id in {part.part_id for part in former.parts.values()}
+    with pytest.raises(rayfix.RayfixError, match=r"1\.5"):
+        rayfix.build(tmp_path / "site.toml", tmp_path / "new.h5", tolerance=1.5)
+    with pytest.raises(rayfix.RayfixError, match=r"missing\.h5"):
+        rayfix.build(tmp_path / "site.toml", tmp_path / "new.h5", former=tmp_path / "missing.h5")
 
 
 def test_the_bundled_report_is_what_the_forward_solver_gives() -> None:
