@@ -1,7 +1,8 @@
 """The builder's speed, as ratios: the ray stage against bare Embree, the fit by tubes against the fit by em.
 
-What is compared runs on one thread and is given as the median of five runs of processor time. ``--build`` builds the
-whole hall as well, on all cores: once with nothing compiled yet, and once more.
+What is compared runs on one thread and is given as the median of five runs of processor time; the sums of wide cells
+run once. ``--build`` builds the whole hall as well, on all cores: once with nothing compiled yet, and once more. The
+machine's load is printed with it.
 """
 
 import argparse
@@ -18,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
+from held_out import COMPONENT_BYTES
 from numpy.typing import NDArray
 
 from rayfix.example.files import write_example
@@ -34,7 +36,6 @@ from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.trace import LevelRays, StationTrace, level_grid, reflectivity_of, trace_station
 from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_offline.twin import Twin, prepare_twin
-from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
 
 RUNS = 5
 
@@ -137,9 +138,6 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
 def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: np.random.Generator) -> float:
     """Time both fits of the finest window, and return the seconds in which tubes' groups are gathered in all cells."""
     level = traced.finest
-    component = sum(
-        int(np.prod(shape, dtype=int)) * np.dtype(FIELD_DTYPES[name]).itemsize for name, shape in FIELD_SHAPES.items()
-    )
     em = ExpectationMaximisation(num_components=(16,))
     numbers = scattered_blocks(level.grid.num_cells, num_cells, rng)
     centres = level.grid.centres[numbers]
@@ -150,7 +148,7 @@ def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: n
     print(
         f"fits of {np.rad2deg(level.window):g} deg cells:\n"
         f"  tubes              {1.0 / tubes:6.0f} cells/s, {counts.mean():.1f} components, "
-        f"{counts.mean() * component:.0f} bytes per cell\n"
+        f"{counts.mean() * COMPONENT_BYTES:.0f} bytes per cell\n"
         f"  em, 16 components  {1.0 / slow:6.1f} cells/s\n"
         f"  tubes / em         {slow / tubes:6.0f}"
     )
@@ -158,7 +156,7 @@ def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: n
 
 
 def measure_levels(traced: StationTrace, site: SiteFile, gather: float) -> dict[str, float]:
-    """Fit all cells of a station once, level by level."""
+    """Make all cells of a station once, level by level; the wide ones are sums of finer ones."""
     window = traced.finest.window
     begin = time.thread_time()
     parts = [
@@ -168,12 +166,20 @@ def measure_levels(traced: StationTrace, site: SiteFile, gather: float) -> dict[
     finer = assemble_level(window, traced.finest.grid, parts)
     name = f"{np.rad2deg(window):g} deg"
     seconds = {f"{name}: gather": gather, f"{name}: merge, the rest": time.thread_time() - begin - gather}
+    print("sums of cells:")
     for window in np.deg2rad(site.table.windows_deg[1:]).tolist():
         grid = level_grid(window)
         widen_cells(np.arange(1), window, grid, finer, np.zeros(finer.grid.num_cells, np.float32))
         begin = time.thread_time()
         wide = widen_cells(np.arange(grid.num_cells), window, grid, finer, np.zeros(finer.grid.num_cells, np.float32))
-        seconds[f"{np.rad2deg(window):g} deg: sums of cells"] = time.thread_time() - begin
+        taken = time.thread_time() - begin
+        name = f"{np.rad2deg(window):g} deg"
+        seconds[f"{name}: sums of cells"] = taken
+        components = wide.counts.mean()
+        print(
+            f"  {name:18} {grid.num_cells / taken:6.0f} cells/s, {components:.1f} components, "
+            f"{components * COMPONENT_BYTES:.0f} bytes per cell"
+        )
         finer = assemble_level(window, grid, [wide])
     return seconds
 
@@ -228,6 +234,7 @@ def measure_build(site_path: Path) -> None:
             table = site_path.with_name("hall.h5")
             table.unlink(missing_ok=True)
             command = [sys.executable, "-m", "rayfix", "build", str(site_path), "-o", str(table), "--no-progress"]
+            load = os.getloadavg()[0]
             before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
             done = subprocess.run(
                 [*command, "--json"],
@@ -243,7 +250,8 @@ def measure_build(site_path: Path) -> None:
             cells = sum(station["num_cells"] for station in summary["stations"])
             size = table.stat().st_size
             print(
-                f"build, {name}: {seconds:.1f} s on {os.cpu_count()} cores, {worked:.1f} s of processor time; "
+                f"build, {name}: {seconds:.1f} s on {os.cpu_count()} cores (load {load:.1f} before), "
+                f"{worked:.1f} s of processor time; "
                 f"{cells} cells of {len(summary['stations'])} stations, {cells / seconds:.0f} cells/s; "
                 f"{size / 1e6:.0f} MB, {size / cells:.0f} bytes per cell; "
                 f"peak memory {summary['peak_bytes'] / 1e6:.0f} MB"

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from fit_study import log_densities
+from held_out import log_densities
 from numpy.typing import NDArray
 
 from rayfix_offline.em import sample_points

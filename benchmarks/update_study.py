@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from fit_study import log_densities
+from held_out import log_densities
 
 from rayfix.evaluation.accuracy import drop_uniformly
 from rayfix.evaluation.simulate import Noise, simulate_report

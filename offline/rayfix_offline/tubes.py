@@ -30,7 +30,7 @@ class TubeFit:
         Divergence that a merge may cost, nats.
     """
 
-    dropped_mass: float = 1e-4
+    dropped_mass: float = 1e-5
     max_groups: int = 250
     max_components: int = 48
     max_divergence: float = 1e-2
