@@ -99,11 +99,13 @@ class Locator:
 
     def warm_up(self) -> None:
         """Compile the kernels and prepare reports without angles, by locating a report of each kind."""
+        window = self.table.parts[self.table.site.stations[0].id].levels[0].window
         for station in self.table.site.stations:
-            angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=0.02, zenith_stdev=0.02)
             length = Range(station_id=station.id, path_length=5.0, stdev=0.5)
-            self.locate(Report(measurements=(angle, length)))
             self.locate(Report(measurements=(length,)))
+            for stdev in (0.5 * window, window):  # looked up in one cell and in several
+                angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=stdev, zenith_stdev=stdev)
+                self.locate(Report(measurements=(angle, length)))
 
     def _product(self, report: Report) -> "_Product":
         """Multiply what the measurements say."""
