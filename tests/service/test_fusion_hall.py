@@ -160,7 +160,7 @@ def test_the_beam_finds_what_the_exhaustive_product_finds(hall: Hall, timing: Ti
     """All of some 40 000 products of the twelve best alternatives of each station, for every third place.
 
     Without merging a beam that is wide enough keeps all of them that can matter. The default one merges: mostly a
-    thousandth of a nat and of the posterior's width is lost, at worst some hundredths.
+    thousandth of a nat and of the posterior's width is lost; at worst hundredths of a nat, and a tenth of the width.
     """
     evidence_errors, shifts = [], []
     for n in range(TIMINGS.index(timing), 100, 3):
@@ -177,7 +177,7 @@ def test_the_beam_finds_what_the_exhaustive_product_finds(hall: Hall, timing: Ti
             prior=even_prior(hall.table.scene.free_space),
         )
         whole = products(width=len(log_weight) + 1, max_divergence=0.0)
-        # What the beam gives up is 30 nats below the best before the last factor is known.
+        # What the beam gives up is 20 nats below the best before the last factor is known.
         likely = int((share > 1e-4).sum())
         np.testing.assert_allclose(whole.log_weight[:likely], log_weight[:likely], rtol=0, atol=1e-6)  # nats
         kept = np.exp(whole.log_weight - log_sum)
@@ -190,7 +190,7 @@ def test_the_beam_finds_what_the_exhaustive_product_finds(hall: Hall, timing: Ti
         shifts.append(np.linalg.norm(kept @ beam.mean / kept.sum() - whole_mean) / width)
     assert max(evidence_errors) < 0.05  # nats
     assert np.median(evidence_errors) < 1e-3
-    assert max(shifts) < 0.1  # of the posterior's standard deviation
+    assert max(shifts) < 0.15  # of the posterior's standard deviation
     assert np.median(shifts) < 2e-3
 
 
