@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.moments import CUTOFF
+from rayfix_offline.moments import CUTOFF, ring_span
 from rayfix_offline.trace import LevelRays
 
 SAME_COURSE = 1e-6
@@ -212,12 +212,7 @@ def _sum_over_cells(
         last_ring = min(num_rings - 1, int((centre_zenith + reach) / np.pi * num_rings))
         for ring in range(first_ring, last_ring + 1):
             cells = ring_cells[ring]
-            half = reach / sine / (2.0 * np.pi) * cells
-            middle = (centre_azimuth + np.pi) / (2.0 * np.pi) * cells
-            if 2.0 * half + 2.0 >= cells:
-                begin, stop = 0, cells
-            else:
-                begin, stop = int(np.floor(middle - half)), int(np.floor(middle + half)) + 1
+            begin, stop = ring_span(centre_azimuth, reach / sine, cells)
             for step in range(begin, stop):
                 ray = ring_offsets[ring] + step % cells
                 turn = azimuth[ray] - centre_azimuth

@@ -26,6 +26,19 @@ NUM_SUMS = 28
 """Sums of a group: 6 of mass (1, a, a a), 12 of mass x length (1, a, d, d a), 10 of mass x length^2 (1, d, d d)."""
 
 
+@numba.njit(cache=True, nogil=True)
+def ring_span(azimuth: Any, reach: Any, cells: Any) -> Any:
+    """First step, and the one after the last, of those of a ring's cells that lie within a reach [rad] of an azimuth.
+
+    Steps count from -pi and may be outside of the ring, to be taken modulo its cells.
+    """
+    half = reach / (2.0 * np.pi) * cells
+    middle = (azimuth + np.pi) / (2.0 * np.pi) * cells
+    if 2.0 * half + 2.0 >= cells:
+        return 0, cells
+    return int(np.floor(middle - half)), int(np.floor(middle + half)) + 1
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def gather_groups(
     centre_azimuth: Any,
@@ -83,12 +96,7 @@ def gather_groups(
     last_ring = min(num_rings - 1, int((centre_zenith + reach) / np.pi * num_rings))
     for ring in range(first_ring, last_ring + 1):
         cells = ring_cells[ring]
-        half = reach / sine / (2.0 * np.pi) * cells
-        middle = (centre_azimuth + np.pi) / (2.0 * np.pi) * cells
-        if 2.0 * half + 2.0 >= cells:
-            begin, stop = 0, cells
-        else:
-            begin, stop = int(np.floor(middle - half)), int(np.floor(middle + half)) + 1
+        begin, stop = ring_span(centre_azimuth, reach / sine, cells)
         for step in range(begin, stop):
             ray = ring_offsets[ring] + step % cells
             turn = azimuth[ray] - centre_azimuth
