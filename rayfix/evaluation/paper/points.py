@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.engine import EmbreeEngine, RayEngine
-from rayfix_offline.launch import launch
+from rayfix_offline.launch import Segments, launch
 from rayfix_offline.materials import Reflectivity, constant_reflectivity
 from rayfix_offline.planes import Planes, merge_coplanar
 from rayfix_service.fusion.lookup import Direction
@@ -75,6 +75,19 @@ class Launcher:
             max_path_length=float(propagation["max_path_length_m"]),
         )
 
+    def trace(self, station: NDArray[np.float64], directions: NDArray[np.float64]) -> Segments:
+        """Launch rays from a station, a position of shape (3,), m, in directions of shape (n_rays, 3), unit vectors."""
+        return launch(
+            station,
+            directions,
+            engine=self.engine,
+            planes=self.planes,
+            reflectivity=self.reflectivity,
+            bounds=self.bounds,
+            max_reflections=self.max_reflections,
+            max_path_length=self.max_path_length,
+        )
+
 
 def draw_directions(measured: Direction, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Draw launch directions from N(angle of arrival, R), or from all around where no angle was measured.
@@ -122,16 +135,7 @@ def points_on_rays(
     step : float, m
         Between points of a ray; the first of each ray is a random part of it away from the station.
     """
-    segments = launch(
-        station,
-        directions,
-        engine=launcher.engine,
-        planes=launcher.planes,
-        reflectivity=launcher.reflectivity,
-        bounds=launcher.bounds,
-        max_reflections=launcher.max_reflections,
-        max_path_length=launcher.max_path_length,
-    )
+    segments = launcher.trace(station, directions)
     phase = step * rng.random(len(directions))
     ray, depth = np.nonzero(segments.sequence >= 0)
     first = np.ceil((segments.start[ray, depth] - phase[ray]) / step).astype(np.int64)
