@@ -1,16 +1,14 @@
 """The HTTP service as a process of its own, and what it checks before it starts."""
 
 import json
-import re
-import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import httpx
 import pytest
 
 from rayfix_service.http.examples import REPORT_EXAMPLES
@@ -24,69 +22,13 @@ from rayfix_service.http.server import (
 from rayfix_tables.errors import NotATableError, TableError
 
 REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]
+StartServer = Callable[..., Any]
 
 
-class ServerProcess:
-    """A server in a process of its own, on a free loopback port."""
-
-    def __init__(self, table_path: Path, workers: int, options: str = "") -> None:
-        code = (
-            "import sys; from rayfix_service.http.server import serve; "
-            f"serve(sys.argv[1], port=0, workers=int(sys.argv[2]), {options})"
-        )
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", code, str(table_path), str(workers)], stderr=subprocess.PIPE, text=True
-        )
-        self.log: list[str] = []
-        self._listening = threading.Event()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            self.log.append(line)
-            if "running on http://" in line:
-                self._listening.set()
-
-    def port(self) -> int:
-        """Wait until it listens, and return the port."""
-        assert self._listening.wait(60), "".join(self.log)
-        (line,) = (line for line in self.log if "running on http://" in line)
-        return int(re.findall(r"http://127\.0\.0\.1:(\d+)", line)[0])
-
-    def wait_until_ready(self, http: httpx.Client) -> None:
-        """Wait until ``/readyz`` is 200."""
-        deadline = time.monotonic() + 100
-        while True:
-            try:
-                if http.get("/readyz").status_code == 200:
-                    return
-            except httpx.ConnectError:  # a worker that does not listen yet
-                pass
-            assert time.monotonic() < deadline, "".join(self.log)
-            time.sleep(0.05)
-
-    def stop(self) -> str:
-        """Ask the server to end, and return its log."""
-        self.process.send_signal(signal.SIGTERM)
-        try:
-            self.process.wait(30)
-        finally:
-            self.process.kill()
-            self._reader.join(10)
-            assert self.process.stderr is not None
-            self.process.stderr.close()
-        return "".join(self.log)
-
-
-def test_a_real_server_answers_and_ends(hall_table_path: Path):
-    server = ServerProcess(hall_table_path, workers=1)
-    try:
-        port = server.port()
-        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30, trust_env=False) as http:
-            assert http.get("/livez").status_code == 200
-            server.wait_until_ready(http)
+def test_a_real_server_answers_and_ends(hall_table_path: Path, start_server: StartServer):
+    with start_server(hall_table_path) as server:
+        with server.client() as http:
+            assert http.get("/livez").status_code == http.get("/readyz").status_code == 200
             fix = http.post("/v1/positions", json=REPORT)
             assert fix.status_code == 200
             assert fix.json()["position"] is not None
@@ -101,55 +43,38 @@ def test_a_real_server_answers_and_ends(hall_table_path: Path):
             ("/v1/positions/batch", len(batch), batch),
         ]:
             head = [f"POST {path} HTTP/1.1", "Host: x", "Content-Type: application/json"]
-            with socket.create_connection(("127.0.0.1", port)) as connection:
+            with socket.create_connection(("127.0.0.1", server.port)) as connection:
                 connection.sendall("\r\n".join([*head, f"Content-Length: {length}", "", body]).encode())
                 time.sleep(0.2)
-        deadline = time.monotonic() + 5
-        while not any("batch given up after" in line for line in server.log):
-            assert time.monotonic() < deadline, "".join(server.log)
-            time.sleep(0.02)
-        with pytest.raises(ServiceError, match=f"port {port}.*give another"):
-            serve(hall_table_path, port=port)
-    finally:
+        server.wait_for("batch given up after")
+        with pytest.raises(ServiceError, match=f"port {server.port}.*give another"):
+            serve(hall_table_path, port=server.port)
         log = server.stop()
     assert "Traceback" not in log
     assert "ERROR" not in log
-    assert "ready with table" in log
     assert "Application shutdown complete" in log
 
 
 @pytest.mark.slow
-def test_several_workers_share_a_port(hall_table_path: Path):
-    server = ServerProcess(hall_table_path, workers=2)
-    try:
-        base_url = f"http://127.0.0.1:{server.port()}"
-        with httpx.Client(base_url=base_url, timeout=30, trust_env=False) as http:
-            server.wait_until_ready(http)
-        deadline = time.monotonic() + 100
-        while sum("ready with table" in line for line in server.log) < 2:
-            assert time.monotonic() < deadline, "".join(server.log)
-            time.sleep(0.05)
+def test_several_workers_share_a_port(hall_table_path: Path, start_server: StartServer):
+    with start_server(hall_table_path, workers=2) as server:
         for _ in range(4):
-            with httpx.Client(base_url=base_url, timeout=30, trust_env=False) as http:
+            with server.client() as http:
                 assert http.post("/v1/positions", json=REPORT).status_code == 200
         # Whichever worker is asked answers for both.
         for _ in range(4):
-            with httpx.Client(base_url=base_url, timeout=30, trust_env=False) as http:
+            with server.client() as http:
                 figures = http.get("/metrics").text
             assert 'rayfix_http_requests_total{method="POST",route="/v1/positions",status="200"} 4.0' in figures
             assert "rayfix_ready 1.0" in figures
-    finally:
         log = server.stop()
     assert "Traceback" not in log
 
 
-def test_the_log_may_be_json(hall_table_path: Path):
-    server = ServerProcess(hall_table_path, workers=1, options="log_format='json', access_log=True")
-    try:
-        with httpx.Client(base_url=f"http://127.0.0.1:{server.port()}", timeout=30, trust_env=False) as http:
-            server.wait_until_ready(http)
+def test_the_log_may_be_json(hall_table_path: Path, start_server: StartServer):
+    with start_server(hall_table_path, log_format="json", access_log=True) as server:
+        with server.client() as http:
             assert http.post("/v1/positions", json=REPORT, headers={"x-request-id": "r-1"}).status_code == 200
-    finally:
         log = server.stop()
     entries = [json.loads(line) for line in log.splitlines()]
     assert all(entry.keys() >= {"time", "level", "logger", "message"} for entry in entries)

@@ -1,5 +1,6 @@
 """The JSON contract: what it takes, what it refuses, and how units come across."""
 
+import dataclasses
 import json
 import math
 import re
@@ -38,6 +39,7 @@ from rayfix_service.wire import (
     parse_report,
     path_text,
     problems_of,
+    report_to_document,
 )
 from rayfix_tables.errors import ReportError
 
@@ -676,3 +678,82 @@ def test_answer_and_schema_have_the_same_keys():
     assert FixDocument.model_validate(document).model_dump(mode="json") == document
     assert list(FIX_EXAMPLE) == list(document)
     FixDocument.model_validate(FIX_EXAMPLE)
+
+
+# --- the way back ----------------------------------------------------------------------------------------
+
+STATIONS = st.sampled_from(["bs1", "bs2", "bs3"])
+METRES = st.floats(1e-3, 1e6)
+ERROR_MODELS = st.one_of(
+    st.just(ErrorModel()), st.builds(ErrorModel, tail_share=st.floats(1e-3, 0.5), tail_scale=st.floats(1.5, 20))
+)
+SINGLE_ANGLES = st.builds(
+    Angle,
+    station_id=STATIONS,
+    azimuth=st.floats(-3.14, 3.14),
+    azimuth_stdev=st.floats(1e-6, 6.0),
+    frame=st.sampled_from(["scene", "lcs", "north"]),
+    error_model=ERROR_MODELS,
+)
+FULL_ANGLES = st.builds(
+    Angle,
+    station_id=STATIONS,
+    azimuth=st.floats(-3.14, 3.14),
+    azimuth_stdev=st.floats(1e-6, 6.0),
+    zenith=st.floats(0.0, 3.14),
+    zenith_stdev=st.floats(1e-6, 6.0),
+    correlation=st.floats(-0.99, 0.99),
+)
+LENGTHS = st.one_of(
+    *(
+        st.builds(kind, station_id=STATIONS, path_length=METRES, stdev=METRES, error_model=ERROR_MODELS)
+        for kind in (Range, TimeOfArrival)
+    )
+)
+LOG_RANGES = st.builds(LogRange, station_id=STATIONS, path_length=st.floats(0.01, 1e4), log_stdev=st.floats(0.02, 1.4))
+DIFFERENCES = st.builds(
+    TimeDifference,
+    station_id=STATIONS,
+    reference_station_id=st.just("bs4"),
+    length_difference=st.floats(-1e6, 1e6),
+    stdev=METRES,
+)
+
+
+@given(
+    measurements=st.lists(
+        st.one_of(SINGLE_ANGLES, FULL_ANGLES, LENGTHS, LOG_RANGES, DIFFERENCES), min_size=1, max_size=4
+    ),
+    height=st.none() | st.builds(Height, z=st.floats(-100, 100), stdev=st.floats(1e-3, 100)),
+    confidence=st.floats(0.01, 0.99),
+    target_id=st.none() | st.text(max_size=9),
+)
+def test_a_report_comes_back_from_its_document(
+    measurements: list[Any], height: Height | None, confidence: float, target_id: str | None
+):
+    report = Report(
+        measurements=tuple(measurements),
+        height=height,
+        confidence=confidence,
+        target_id=target_id,
+        timestamp="2026-01-31T10:00:00Z",
+    )
+    again = parse_report(json.dumps(report_to_document(report)).encode())
+    assert (again.height, again.confidence, again.target_id, again.timestamp) == (
+        height,
+        confidence,
+        target_id,
+        report.timestamp,
+    )
+    for before, after in zip(report.measurements, again.measurements, strict=True):
+        assert type(after) is type(before)
+        for field in dataclasses.fields(before):
+            value = getattr(before, field.name)
+            expected = pytest.approx(value, rel=1e-9, abs=1e-13) if isinstance(value, float) else value
+            assert getattr(after, field.name) == expected
+
+
+@pytest.mark.parametrize("name", ["angle_and_time", "angles"])
+def test_a_document_in_metres_and_degrees_is_itself_again(name: str):
+    document = REPORT_EXAMPLES[name]["value"]
+    assert report_to_document(parse_report(document)) == document

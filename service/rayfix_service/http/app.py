@@ -12,11 +12,14 @@ from pydantic.json_schema import models_json_schema
 from rayfix_service.adapters.nrppa_documents import NrppaDocument
 from rayfix_service.adapters.silabs import SilabsDocument
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.http import routes_formats, routes_health, routes_positions, routes_table
+from rayfix_service.http import routes_formats, routes_health, routes_positions, routes_stream, routes_table
 from rayfix_service.http.dependencies import BodyLimits, Service
+from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.metrics import Metrics
 from rayfix_service.http.problems import Problem, install_problems
 from rayfix_service.http.request_context import RequestContext
+from rayfix_service.http.routes_stream import FixEventDocument
+from rayfix_service.http.stopping import on_stop_signal
 from rayfix_service.wire import BatchDocument, ReportDocument
 from rayfix_tables.table import Table
 
@@ -42,6 +45,7 @@ class RayfixApp(FastAPI):
                     (BatchDocument, "validation"),
                     (NrppaDocument, "validation"),
                     (SilabsDocument, "validation"),
+                    (FixEventDocument, "validation"),
                     (Problem, "serialization"),
                 ],
                 ref_template="#/components/schemas/{model}",
@@ -73,8 +77,10 @@ def create_app(table_path: Path, *, body_limits: BodyLimits | None = None) -> Fa
         app.state.service = Service(Locator(table), on_ready=app.state.metrics.became_ready)
         preparation = asyncio.create_task(app.state.service.prepare())
         try:
-            yield
+            with on_stop_signal(app.state.feed.close):
+                yield
         finally:
+            app.state.feed.close()
             await preparation  # its thread would outlive the loop
 
     app = RayfixApp(
@@ -87,10 +93,12 @@ def create_app(table_path: Path, *, body_limits: BodyLimits | None = None) -> Fa
     )
     app.state.body_limits = body_limits or BodyLimits()
     app.state.metrics = Metrics()
+    app.state.feed = FixFeed()
     install_problems(app)
     app.add_middleware(RequestContext, metrics=app.state.metrics)  # around all, to see the last resort's answers too
     app.include_router(routes_positions.router)
     app.include_router(routes_formats.router)
+    app.include_router(routes_stream.router)
     app.include_router(routes_table.router)
     app.include_router(routes_health.router)
     return app

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import Depends, Request
-from starlette.requests import ClientDisconnect
+from starlette.requests import ClientDisconnect, HTTPConnection
 
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.http.problems import (
@@ -86,13 +86,19 @@ class Service:
         )
 
 
-async def get_locator(request: Request) -> Locator:
+async def get_locator(connection: HTTPConnection) -> Locator:
     """Return the locator, or end the request with 503."""
-    service: Service = request.app.state.service
+    service: Service = connection.app.state.service
     return service.locator()
 
 
 LocatorDep = Annotated[Locator, Depends(get_locator)]
+
+
+def report_limit(connection: HTTPConnection) -> int:
+    """Return how long a report may be, bytes."""
+    limits: BodyLimits = connection.app.state.body_limits
+    return limits.report
 
 
 def body_reader(limit_of: Callable[[BodyLimits], int], *, text: bool = False) -> Callable[[Request], Awaitable[bytes]]:

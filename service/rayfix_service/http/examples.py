@@ -151,6 +151,13 @@ FIX_EXAMPLE: dict[str, Any] = {
 }
 """An answer to the first report."""
 
+FIX_EVENT_EXAMPLE: dict[str, Any] = {
+    "table": "hall",
+    "report": REPORT_EXAMPLES["angle_and_time"]["value"],
+    "fix": FIX_EXAMPLE,
+}
+"""The data of an event of ``GET /v1/fixes``."""
+
 _MESSAGE = "measurements[0].azimuth_stdev_deg is -1; give a positive standard deviation in degrees, 1e-06 to 360"
 
 PROBLEM_EXAMPLE: dict[str, Any] = {

@@ -2,20 +2,25 @@
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from typing import Annotated, Any
 
-from fastapi import Depends, Request
+from fastapi import Depends
+from pydantic_core import from_json, to_json
+from starlette.requests import HTTPConnection
 
 from rayfix_service.adapters.adapted import Adapted, error_in_message
 from rayfix_service.adapters.formats import OutputFormat, write
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import Fix, Report
 from rayfix_service.http.dependencies import LocatorDep
+from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.metrics import Metrics
 from rayfix_service.http.problems import internal_problem, report_problem
+from rayfix_service.wire import fix_to_document, parse_report, report_to_document
 from rayfix_tables.errors import ReportError
 
 _log = logging.getLogger(__name__)
@@ -28,13 +33,54 @@ _MEASUREMENTS_ON_LOOP = 16
 
 
 @dataclass(frozen=True, kw_only=True)
+class Incoming:
+    """A report with what it was made from.
+
+    Attributes
+    ----------
+    report : Report
+    adapted : Adapted, optional
+        Where it came from, if from another format.
+    document : Mapping or bytes, optional
+        The report as it was posted, if in this project's own format.
+    """
+
+    report: Report
+    adapted: Adapted | None = None
+    document: Mapping[str, Any] | bytes | None = None
+
+    def native_document(self) -> Any:
+        """Return the report as this project's JSON."""
+        if isinstance(self.document, bytes):
+            return from_json(self.document)
+        return report_to_document(self.report) if self.document is None else self.document
+
+
+def native(document: Mapping[str, Any] | bytes) -> Incoming:
+    """Read a report of this project's own format.
+
+    Raises
+    ------
+    ReportError
+        When it cannot be used.
+    """
+    return Incoming(report=parse_report(document), document=document)
+
+
+def foreign(adapted: Adapted) -> Incoming:
+    """Take a report made from a message of another format."""
+    return Incoming(report=adapted.report, adapted=adapted)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Answerer:
-    """What answers reports: the locator, and the figures that it adds to."""
+    """What answers reports: the locator, the figures that it adds to, and the feed that it tells."""
 
     locator: Locator
     metrics: Metrics
+    feed: FixFeed
 
-    async def answer(self, report: Report | Adapted, output: OutputFormat) -> dict[str, Any]:
+    async def answer(self, incoming: Incoming, output: OutputFormat) -> dict[str, Any]:
         """Locate a report and write the answer in a format.
 
         Raises
@@ -42,27 +88,24 @@ class Answerer:
         ReportError
             When a station is not in the table, or the format needs a position and there is none.
         """
-        site = self.locator.table.site
-        if isinstance(report, Report):
-            fix, seconds = await self._locate(report)
-            return write(fix, output, site, compute_seconds=seconds)
         try:
-            fix, seconds = await self._locate(report.report)
+            fix, seconds = await self._locate(incoming.report)
         except ReportError as error:
-            raise error_in_message(error, report) from None
-        return write(fix, output, site, compute_seconds=seconds, adapted=report)
+            if incoming.adapted is None:
+                raise
+            raise error_in_message(error, incoming.adapted) from None
+        self.feed.publish(fix.target_id, partial(self._event, incoming, fix, seconds))
+        return write(fix, output, self.locator.table.site, compute_seconds=seconds, adapted=incoming.adapted)
 
-    async def answer_or_problem(
-        self, make_report: Callable[[], Report | Adapted], output: OutputFormat
-    ) -> dict[str, Any]:
+    async def answer_or_problem(self, make: Callable[[], Incoming], output: OutputFormat) -> dict[str, Any]:
         """Answer one report of several, with a problem where it cannot be used."""
         try:
-            return await self.answer(make_report(), output)
+            return await self.answer(make(), output)
         except ReportError as error:
             return report_problem(error)
         except Exception:
             # A defect that one report meets must not cost the other 999 their fix.
-            _log.exception("a report of a batch failed")
+            _log.exception("a report of several failed")
             return internal_problem()
 
     async def _locate(self, report: Report) -> tuple[Fix, float]:
@@ -76,10 +119,20 @@ class Answerer:
         self.metrics.fix_done(fix, seconds)
         return fix, seconds
 
+    def _event(self, incoming: Incoming, fix: Fix, seconds: float) -> bytes:
+        return to_json(
+            {
+                "table": self.locator.table.path.stem,
+                "report": incoming.native_document(),
+                "fix": fix_to_document(fix, seconds),
+            }
+        )
 
-async def get_answerer(request: Request, locator: LocatorDep) -> Answerer:
+
+async def get_answerer(connection: HTTPConnection, locator: LocatorDep) -> Answerer:
     """Return what answers, or end the request with 503."""
-    return Answerer(locator=locator, metrics=request.app.state.metrics)
+    state = connection.app.state
+    return Answerer(locator=locator, metrics=state.metrics, feed=state.feed)
 
 
 AnswererDep = Annotated[Answerer, Depends(get_answerer)]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fastapi import FastAPI, Request
-from fastapi.exceptions import RequestValidationError
+from fastapi.exceptions import RequestValidationError, WebSocketRequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
@@ -133,7 +133,7 @@ async def _answer_report(request: Request, error: Exception) -> JSONResponse:
 
 async def _answer_validation(request: Request, error: Exception) -> JSONResponse:
     """Answer a parameter that FastAPI itself refuses, such as one of a query."""
-    assert isinstance(error, RequestValidationError)
+    assert isinstance(error, RequestValidationError | WebSocketRequestValidationError)
     errors = [
         FieldProblem(path=tuple(e["loc"][1:]), message=f"{path_text(tuple(e['loc'][1:]))}: {e['msg']}")
         for e in error.errors()
@@ -188,5 +188,6 @@ def install_problems(app: FastAPI) -> None:
     app.add_exception_handler(ProblemError, _answer_problem)
     app.add_exception_handler(ReportError, _answer_report)
     app.add_exception_handler(RequestValidationError, _answer_validation)
+    app.add_exception_handler(WebSocketRequestValidationError, _answer_validation)  # before the handshake
     app.add_exception_handler(HTTPException, _answer_http)
     app.add_middleware(LastResort)

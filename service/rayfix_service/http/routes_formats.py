@@ -15,7 +15,7 @@ from rayfix_service.adapters.silabs import SilabsDocument, parse_silabs
 from rayfix_service.adapters.ublox import parse_ublox
 from rayfix_service.http.dependencies import LinesBody, ReportBody
 from rayfix_service.http.examples import NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
-from rayfix_service.http.locating import AnswererDep
+from rayfix_service.http.locating import AnswererDep, foreign
 from rayfix_service.http.outputs import (
     ADAPTED_ANSWER,
     POSITION_PROBLEMS,
@@ -45,7 +45,7 @@ class LinesResult(BaseModel):
 )
 async def post_nrppa(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JSONResponse:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    return JSONResponse(await answerer.answer(parse_nrppa(body), output))
+    return JSONResponse(await answerer.answer(foreign(parse_nrppa(body)), output))
 
 
 @router.post(
@@ -57,7 +57,7 @@ async def post_nrppa(answerer: AnswererDep, body: ReportBody, output: Output = "
 )
 async def post_silabs(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JSONResponse:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    return JSONResponse(await answerer.answer(parse_silabs(body), output))
+    return JSONResponse(await answerer.answer(foreign(parse_silabs(body)), output))
 
 
 @router.post(
@@ -86,6 +86,6 @@ async def post_ublox(
     for adapted in parse_ublox(body, stations=station_map(station)):
         if await request.is_disconnected():
             raise ProblemError(CONNECTION_ENDED, "the connection ended before the answer")
-        results.append(await answerer.answer_or_problem(partial(with_height, adapted, known), output))
+        results.append(await answerer.answer_or_problem(partial(foreign, with_height(adapted, known)), output))
         await asyncio.sleep(0)
     return JSONResponse({"results": results})

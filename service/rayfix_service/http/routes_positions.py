@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 
 from rayfix_service.http.dependencies import BatchBody, ReportBody
 from rayfix_service.http.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
-from rayfix_service.http.locating import AnswererDep
+from rayfix_service.http.locating import AnswererDep, native
 from rayfix_service.http.outputs import NATIVE_ANSWER, POSITION_PROBLEMS, NativeOrOther, Output, request_body
 from rayfix_service.http.problems import CONNECTION_ENDED, Problem, ProblemError
 from rayfix_service.wire import (
@@ -20,7 +20,6 @@ from rayfix_service.wire import (
     FieldProblem,
     InvalidReportError,
     ReportDocument,
-    parse_report,
     path_text,
     read_json,
 )
@@ -48,7 +47,7 @@ class BatchResult(BaseModel):
 )
 async def post_position(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JSONResponse:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
-    return JSONResponse(await answerer.answer(parse_report(body), output))
+    return JSONResponse(await answerer.answer(native(body), output))
 
 
 @router.post(
@@ -69,7 +68,7 @@ async def post_batch(
         if await request.is_disconnected():
             _log.info("batch given up after %d of %d reports: the client left", len(results), len(documents))
             raise ProblemError(CONNECTION_ENDED, "the connection ended before the answer")
-        results.append(await answerer.answer_or_problem(partial(parse_report, document), output))
+        results.append(await answerer.answer_or_problem(partial(native, document), output))
         await asyncio.sleep(0)  # a thousand fixes take a second: let other requests in between
     return JSONResponse({"results": results})
 

@@ -18,6 +18,7 @@ from rayfix_tables.table import Table
 TABLE_VARIABLE = "RAYFIX_TABLE"
 """Environment variable that tells worker processes the table's path."""
 
+_MAX_MESSAGE = 16 << 20  # bytes; up to here a message that is too long is answered, beyond it ends the connection
 _SHUTDOWN_SECONDS = 10  # for requests under way; a full batch takes about one
 
 
@@ -79,6 +80,8 @@ def serve(
             host=host,
             port=port,
             workers=workers,
+            ws_max_size=_MAX_MESSAGE,
+            ws_per_message_deflate=False,  # costs more than it saves, on messages of a kilobyte
             timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
             access_log=False,  # this package has one of its own
             log_config=log_config(log_format, access_log=access_log),

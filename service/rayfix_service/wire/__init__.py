@@ -24,6 +24,7 @@ from rayfix_service.wire.response import (
     Point,
     fix_to_document,
 )
+from rayfix_service.wire.writing import report_to_document
 
 __all__ = [
     "MAX_MEASUREMENTS",
@@ -42,4 +43,5 @@ __all__ = [
     "path_text",
     "problems_of",
     "read_json",
+    "report_to_document",
 ]

@@ -1,0 +1,117 @@
+"""The feed of fixes: every fix that this process locates, told to whoever listens."""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+QUEUE_LENGTH = 256
+"""Fixes that wait for a listener; of one that reads more slowly, the oldest are dropped."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FixEvent:
+    """A fix, and the report that it answers.
+
+    Attributes
+    ----------
+    number : int
+        Counts the events of this process.
+    target_id : str or None
+        Target of the report.
+    data : bytes
+        One line of JSON with the keys ``table``, ``report`` and ``fix``.
+    """
+
+    number: int
+    target_id: str | None
+    data: bytes
+
+
+class Subscription:
+    """What waits for one listener.
+
+    Parameters
+    ----------
+    target_id : str, optional
+        The only target to hear of.
+    """
+
+    def __init__(self, target_id: str | None = None) -> None:
+        self._target_id = target_id
+        self._events: deque[FixEvent] = deque(maxlen=QUEUE_LENGTH)
+        self._wake = asyncio.Event()
+        self._dropped = 0
+        self.closed = False
+
+    def put(self, event: FixEvent) -> None:
+        """Queue an event, if it is of the target."""
+        if self._target_id is not None and event.target_id != self._target_id:
+            return
+        self._dropped += len(self._events) == QUEUE_LENGTH
+        self._events.append(event)
+        self._wake.set()
+
+    def close(self) -> None:
+        """End it; what is queued may still be taken."""
+        self.closed = True
+        self._wake.set()
+
+    async def wait(self, seconds: float) -> None:
+        """Wait until there is something to take, it is closed, or the time is over."""
+        try:
+            async with asyncio.timeout(seconds):
+                await self._wake.wait()
+        except TimeoutError:
+            pass
+
+    def take(self) -> tuple[int, list[FixEvent]]:
+        """Take how many events were dropped since the last time, and those that are left."""
+        dropped, events = self._dropped, list(self._events)
+        self._dropped = 0
+        self._events.clear()
+        if not self.closed:
+            self._wake.clear()
+        return dropped, events
+
+
+class FixFeed:
+    """Hands the fixes of one process to its listeners. Of one event loop."""
+
+    def __init__(self) -> None:
+        self._subscriptions: set[Subscription] = set()
+        self._count = 0
+        self._closed = False
+
+    @property
+    def num_listeners(self) -> int:
+        """How many listen."""
+        return len(self._subscriptions)
+
+    @contextmanager
+    def subscribe(self, target_id: str | None = None) -> Iterator[Subscription]:
+        """Listen to all targets, or to one."""
+        subscription = Subscription(target_id)
+        if self._closed:
+            subscription.close()
+        self._subscriptions.add(subscription)
+        try:
+            yield subscription
+        finally:
+            self._subscriptions.remove(subscription)
+
+    def publish(self, target_id: str | None, make_data: Callable[[], bytes]) -> None:
+        """Tell of a fix; its JSON is only made where someone listens."""
+        if not self._subscriptions:
+            return
+        self._count += 1
+        event = FixEvent(number=self._count, target_id=target_id, data=make_data())
+        for subscription in self._subscriptions:
+            subscription.put(event)
+
+    def close(self) -> None:
+        """End all subscriptions, and those that come."""
+        self._closed = True
+        for subscription in self._subscriptions:
+            subscription.close()

@@ -1,0 +1,42 @@
+"""Hear that the process was told to end, before its server waits for open streams to end by themselves."""
+
+import asyncio
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+_DEFAULTS = (signal.SIG_DFL, signal.SIG_IGN, signal.default_int_handler, None)
+
+
+@contextmanager
+def on_stop_signal(callback: Callable[[], None]) -> Iterator[None]:
+    """Call something in the running loop at SIGINT or SIGTERM, besides what the server does then.
+
+    A server that handles these signals stops listening and waits for requests under way; a stream of events would
+    go on until that wait is over. Where nothing handles a signal, it stays like that.
+    """
+    loop = asyncio.get_running_loop()
+    replaced: dict[signal.Signals, Any] = {}
+
+    def chained(handler: Callable[[int, FrameType | None], Any]) -> Callable[[int, FrameType | None], None]:
+        def handle(number: int, frame: FrameType | None) -> None:
+            loop.call_soon_threadsafe(callback)
+            handler(number, frame)
+
+        return handle
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        handler = signal.getsignal(number)
+        if callable(handler) and handler not in _DEFAULTS:
+            try:
+                signal.signal(number, chained(handler))
+            except ValueError:  # not the main thread, which alone has signals
+                break
+            replaced[number] = handler
+    try:
+        yield
+    finally:
+        for number, handler in replaced.items():
+            signal.signal(number, handler)
