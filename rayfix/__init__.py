@@ -15,6 +15,7 @@ from rayfix_tables.version import software_version
 
 if TYPE_CHECKING:
     from rayfix.api import Locator as Locator
+    from rayfix.api import Tracker as Tracker
     from rayfix.api import build as build
     from rayfix_service.fusion.posterior import Posterior as Posterior
     from rayfix_service.fusion.report import Fix as Fix
@@ -33,6 +34,7 @@ __all__ = [
     "RayfixError",
     "Report",
     "Table",
+    "Tracker",
     "__version__",
     "build",
     "range_from_impulse_response",

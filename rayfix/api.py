@@ -8,11 +8,15 @@ from rayfix.extras import needs_extra
 from rayfix_tables.table import Table
 
 with needs_extra("service"):
+    from rayfix_service.fusion.locator import Fused
     from rayfix_service.fusion.locator import Locator as _Locator
     from rayfix_service.fusion.posterior import Posterior
     from rayfix_service.fusion.report import Fix, Report
     from rayfix_service.impulse_response import range_from_impulse_response
     from rayfix_service.ranging import range_from_round_trip, range_from_rssi, range_from_times
+    from rayfix_service.tracking.settings import TrackingSettings
+    from rayfix_service.tracking.tracker import TrackedPosition
+    from rayfix_service.tracking.tracker import Tracker as _Tracker
     from rayfix_service.wire import parse_report
 
 __all__ = [
@@ -20,6 +24,7 @@ __all__ = [
     "Locator",
     "Posterior",
     "Report",
+    "Tracker",
     "build",
     "range_from_impulse_response",
     "range_from_round_trip",
@@ -96,3 +101,47 @@ class Locator(_Locator):
             When the report cannot be used; its ``path`` names the field.
         """
         return super().posterior(report if isinstance(report, Report) else parse_report(report))
+
+    def fuse(self, report: Report | Mapping[str, Any]) -> Fused:
+        """Fuse the measurements of a report and keep what its fix was made of, for :class:`Tracker`.
+
+        Parameters
+        ----------
+        report : Report or mapping
+            A mapping has the form of the JSON that ``POST /v1/positions`` takes.
+
+        Raises
+        ------
+        ReportError
+            When the report cannot be used; its ``path`` names the field.
+        """
+        return super().fuse(report if isinstance(report, Report) else parse_report(report))
+
+
+class Tracker(_Tracker):
+    """Follows targets from report to report; see docs/tracking.md.
+
+    Parameters
+    ----------
+    table : Table
+        Whose walls no target passes.
+    settings : TrackingSettings, optional
+    """
+
+    def __init__(self, table: Table, settings: TrackingSettings | None = None) -> None:
+        super().__init__(table.scene, settings)
+
+    def follow(self, fused: Fused) -> TrackedPosition | None:
+        """Take what :meth:`Locator.fuse` made of a report into its target's track.
+
+        Returns
+        -------
+        TrackedPosition or None
+            None as long as no report has said anything of the position.
+
+        Raises
+        ------
+        ReportError
+            When the report names no target or no time.
+        """
+        return super().follow(fused)

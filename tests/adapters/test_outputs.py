@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from rayfix_service.adapters.formats import write
-from rayfix_service.adapters.omlox import fix_to_omlox, utc_milliseconds
+from rayfix_service.adapters.omlox import fix_to_omlox
 from rayfix_service.adapters.threegpp import fix_to_3gpp
 from rayfix_service.fusion.credible import CredibleRegions
 from rayfix_service.fusion.normal import normal_points
 from rayfix_service.fusion.report import Candidate, Fix, Outcome
 from rayfix_service.http.examples import LOCAL_3D_EXAMPLE, OMLOX_EXAMPLE
 from rayfix_service.http.outputs import Local3dPointUncertaintyEllipsoid, OmloxLocation
+from rayfix_service.moments import utc_milliseconds
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo
 

@@ -82,3 +82,20 @@ def test_uwb(
     # Median horizontal errors of nine fixes; one range of eight is 3 m too long.
     assert rows["rayfix 15 deg, one wrong"][0] < 0.5 * rows["least squares, one wrong"][0]
     assert picture.stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_tracking(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ["--table", str(hall_table_path), "--walks", "2", "--reports", "12"]
+    lines = run("tracking.py", capsys, monkeypatch, *arguments)
+    rows = lines[3:]
+    assert len(rows) == 14
+    for fix, track in zip(rows[::2], rows[1::2], strict=True):
+        assert "fix" in fix
+        assert "track" in track
+        rms, half, most = (float(value) for value in track.split("track")[1].split()[:3])
+        assert 0.0 < half <= most
+        assert half <= 2.0 * rms
+    # With the coarse table and no times, the tracks of all stations' reports are better than the fixes by far.
+    first = [float(line.split(kind)[1].split()[0]) for line, kind in zip(rows, ("fix", "track"), strict=False)]
+    assert first[1] < 0.6 * first[0]

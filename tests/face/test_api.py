@@ -31,6 +31,24 @@ def test_everything_in_all_can_be_imported() -> None:
         rayfix.nothing  # noqa: B018
 
 
+def test_a_tracker_goes_on_with_what_a_locator_fuses(hall_table_path: Path) -> None:
+    table = rayfix.Table.open(hall_table_path)
+    locator, tracker = rayfix.Locator(table), rayfix.Tracker(table)
+    document = json.loads(example_report())
+    spreads = []
+    for tenth in range(6):
+        document["timestamp"] = f"2026-01-31T10:00:00.{tenth}Z"
+        fused = locator.fuse(document)
+        assert fused.fix.log_evidence == locator.locate(document).log_evidence
+        track = tracker.follow(fused)
+        assert track is not None
+        spreads.append(np.trace(track.estimate.covariance))
+    assert (track.state, track.num_reports) == ("updated", 6)
+    assert fused.fix.position is not None
+    assert np.linalg.norm(track.estimate.position - fused.fix.position) < 0.5
+    assert spreads[-1] < 0.7 * spreads[0]
+
+
 def test_a_locator_takes_a_dict_or_a_report(hall_table_path: Path) -> None:
     document = json.loads(example_report())
     locator = rayfix.Locator(rayfix.Table.open(hall_table_path))

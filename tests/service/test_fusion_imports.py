@@ -57,7 +57,10 @@ def run(code: str, blocked: set[str], *arguments: str, **environment: str) -> su
     ("roots", "blocked"),
     [
         (["rayfix_service"], OFFLINE_LIBRARIES | {"rayfix_offline", "rayfix"}),
-        (["rayfix_service.fusion"], OFFLINE_LIBRARIES | {"rayfix_offline", "rayfix", "fastapi", "pydantic", "uvicorn"}),
+        (
+            ["rayfix_service.fusion", "rayfix_service.tracking"],
+            OFFLINE_LIBRARIES | {"rayfix_offline", "rayfix", "fastapi", "pydantic", "uvicorn"},
+        ),
         (["rayfix_tables"], OFFLINE_LIBRARIES | {"rayfix_offline", "rayfix_service", "rayfix", "numba", "pydantic"}),
     ],
 )

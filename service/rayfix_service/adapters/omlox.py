@@ -1,11 +1,10 @@
 """A position as a location object of omlox hubs (omlox Hub API, version 2)."""
 
-import re
-from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from rayfix_service.adapters.positions import best_candidate
 from rayfix_service.fusion.report import Fix
+from rayfix_service.moments import utc_milliseconds
 from rayfix_tables.site import SiteInfo
 
 UNKNOWN_PROVIDER = "unknown"
@@ -44,14 +43,3 @@ def fix_to_omlox(fix: Fix, site: SiteInfo) -> dict[str, Any]:
     if fix.timestamp is not None:
         location["timestamp_generated"] = utc_milliseconds(fix.timestamp)
     return location
-
-
-def utc_milliseconds(timestamp: str) -> str:
-    """Turn a date-time of RFC 3339 into UTC with milliseconds, as omlox wants it."""
-    # Python knows no leap seconds.
-    leap = re.match(r"(.{17})60", timestamp)
-    text = f"{leap[1]}59{timestamp[19:]}" if leap else timestamp
-    # Nor more than six digits of a second.
-    text = re.sub(r"(\.[0-9]{6})[0-9]+", r"\1", text.upper())
-    moment = datetime.fromisoformat(text).astimezone(UTC) + timedelta(seconds=1 if leap else 0)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,5 +1,6 @@
 """The face of the fusion: a table and a report in, a fix out."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -52,7 +53,21 @@ class Locator:
         ReportError
             When the report cannot be used; its ``path`` names the field.
         """
-        observations, unused, _, hypotheses = self._product(report)
+        return self._locate(report, self._product(report))
+
+    def fuse(self, report: Report) -> "Fused":
+        """Locate a report and keep what its fix was made of, for filters that go on with it.
+
+        Raises
+        ------
+        ReportError
+            When the report cannot be used; its ``path`` names the field.
+        """
+        product = self._product(report)
+        return Fused(fix=self._locate(report, product), hypotheses=product.hypotheses, prior=product.prior)
+
+    def _locate(self, report: Report, product: "_Product") -> Fix:
+        observations, unused, _, hypotheses = product
         if hypotheses is None:
             return self._fix(report, "insufficient", (), {}, unused, 0.0, None)
         if not len(hypotheses):
@@ -186,6 +201,27 @@ class Locator:
             target_id=report.target_id,
             timestamp=report.timestamp,
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fused:
+    """A fix, and the likelihood that it comes from.
+
+    The probability density of the report at a place x is ``sum_h exp(log_weight_h) N(x; mean_h, cov_h) / prior(x)``,
+    and ``exp(log_lost)`` besides for the case that all measurements are outliers.
+
+    Attributes
+    ----------
+    fix : Fix
+    hypotheses : Hypotheses or None
+        Of the position, not yet cut to the free space; None where no measurement could be used.
+    prior : Prior
+        Of the position, with which the hypotheses' Gaussians are multiplied.
+    """
+
+    fix: Fix
+    hypotheses: Hypotheses | None
+    prior: Prior
 
 
 class _Product(NamedTuple):

@@ -1,0 +1,77 @@
+"""What a report says of the position, apart from what was known before: for multiplying with a track.
+
+A fix is the product of the measurements and of a prior, even in the free space. A track has a prior of its own, its
+prediction, so the fix's is divided out: else the free space, and a known height, would count anew with each report.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.beam import Hypotheses
+from rayfix_service.fusion.prior import Prior
+
+Array = NDArray[np.float64]
+
+_LOG_2PI = math.log(2.0 * math.pi)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Likelihood:
+    """Likelihood ``sum_h exp(log_scale_h + slope_h . d - d . information_h . d / 2)`` with ``d = x - mean_h``.
+
+    Attributes
+    ----------
+    log_scale : ndarray of shape (h,)
+        Of the probability density of the report; the last is of the case that all measurements are outliers, whose
+        slope and information are zero.
+    mean : ndarray of shape (h, 3), m
+    slope : ndarray of shape (h, 3), 1 / m
+    information : ndarray of shape (h, 3, 3), 1 / m2
+        May be singular: an azimuth alone says nothing of the height.
+    """
+
+    log_scale: Array
+    mean: Array
+    slope: Array
+    information: Array
+
+    def log_density(self, points: Array) -> Array:
+        """Natural logarithm of the likelihood at points of shape (n, 3), m; shape (n,)."""
+        apart = points[:, None, :] - self.mean
+        square = np.einsum("nhi,hij,nhj->nh", apart, self.information, apart)
+        logs = self.log_scale + np.einsum("hi,nhi->nh", self.slope, apart) - 0.5 * square
+        return np.asarray(np.logaddexp.reduce(logs, axis=1))
+
+
+def likelihood_of(hypotheses: Hypotheses, prior: Prior, *, height_share: float) -> Likelihood:
+    """Divide the prior out of a report's hypotheses.
+
+    Parameters
+    ----------
+    hypotheses : Hypotheses
+    prior : Prior
+        That they were multiplied with.
+    height_share : float
+        Share of what is known of the height that is left in, 0 to 1. All reports of a target tell the same of its
+        height, so that no more than one of them may count in full; see ``TrackingSettings.height_seconds``.
+    """
+    taken = (1.0 - height_share) * prior.precision
+    information = np.linalg.inv(hypotheses.cov)
+    log_scale = hypotheses.log_weight + 0.5 * np.linalg.slogdet(information)[1] - 1.5 * _LOG_2PI + prior.log_volume
+    information[:, 2, 2] -= taken
+    slope = np.zeros_like(hypotheses.mean)
+    if prior.precision > 0.0:
+        known = prior.eta / prior.precision
+        from_known = hypotheses.mean[:, 2] - known
+        # Only what is left of the height lowers the likelihood, and where the height is right it does not.
+        log_scale += 0.5 * taken * from_known**2 - 0.5 * prior.eta * known
+        slope[:, 2] = taken * from_known
+    return Likelihood(
+        log_scale=np.append(log_scale, hypotheses.log_lost),
+        mean=np.concatenate([hypotheses.mean, np.zeros((1, 3))]),
+        slope=np.concatenate([slope, np.zeros((1, 3))]),
+        information=np.concatenate([information, np.zeros((1, 3, 3))]),
+    )

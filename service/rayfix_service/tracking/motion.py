@@ -1,0 +1,94 @@
+"""How a target moves: nearly constant velocity, each axis on its own.
+
+The acceleration is white noise of spectral density q. Over a time t the position x and the velocity v become
+
+    x' = x + t v + e_x,   v' = v + e_v,   cov(e_x, e_v) = q [[t^3 / 3, t^2 / 2], [t^2 / 2, t]]
+
+(Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, 6.2.2;
+Stone Soup's ``ConstantVelocity``). Of a particle the position is known and the velocity is Gaussian. Nothing of that
+Gaussian's variance depends on where the particle went, so all particles share it: three numbers.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionModel:
+    """How a target may move.
+
+    Attributes
+    ----------
+    acceleration_density, vertical_acceleration_density : float, m2 / s3
+        Spectral density of the white acceleration along x and y, and along z: after a second the velocity has changed
+        by a Gaussian of this variance.
+    speed_stdev, vertical_speed_stdev : float, m / s
+        Of each component of the velocity of a target that has just been seen for the first time.
+    """
+
+    acceleration_density: float = 0.5
+    vertical_acceleration_density: float = 0.02
+    speed_stdev: float = 1.0
+    vertical_speed_stdev: float = 0.2
+
+    @property
+    def density(self) -> Array:
+        """Spectral densities of the acceleration along x, y and z, shape (3,), m2 / s3."""
+        return np.array([self.acceleration_density, self.acceleration_density, self.vertical_acceleration_density])
+
+    @property
+    def first_velocity_variance(self) -> Array:
+        """Variances of the velocity of a new target along x, y and z, shape (3,), m2 / s2."""
+        return np.array([self.speed_stdev, self.speed_stdev, self.vertical_speed_stdev]) ** 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """What a particle does within a time, along each axis.
+
+    Attributes
+    ----------
+    seconds : float
+    variance : ndarray of shape (3,), m2
+        Of the new position about ``position + seconds * velocity``.
+    gain : ndarray of shape (3,), 1 / s
+        By which the velocity follows the new position's distance from there.
+    velocity_variance : ndarray of shape (3,), m2 / s2
+        Of the velocity once the new position is known.
+    """
+
+    seconds: float
+    variance: Array
+    gain: Array
+    velocity_variance: Array
+
+
+def step_of(model: MotionModel, velocity_variance: Array, seconds: float) -> Step:
+    """Predict, and condition the velocity on the position as a Kalman filter does that measures it without noise.
+
+    T. Schon, F. Gustafsson, P.-J. Nordlund, "Marginalized particle filters for mixed linear/nonlinear state-space
+    models", IEEE Trans. Signal Processing 53 (7), 2005: the position is the nonlinear part of the state, the velocity
+    the linear one.
+
+    Parameters
+    ----------
+    model : MotionModel
+    velocity_variance : ndarray of shape (3,), m2 / s2
+        Before the step.
+    seconds : float
+        Positive.
+    """
+    density = model.density
+    variance = seconds**2 * velocity_variance + density * seconds**3 / 3.0
+    both = seconds * velocity_variance + density * seconds**2 / 2.0
+    gain = both / variance
+    return Step(
+        seconds=seconds,
+        variance=variance,
+        gain=gain,
+        velocity_variance=velocity_variance + density * seconds - gain * both,
+    )

@@ -1,0 +1,205 @@
+"""All targets that are followed, and what becomes of a report whose time does not fit."""
+
+import hashlib
+import math
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from threading import Lock
+from time import monotonic
+from typing import Literal
+
+import numpy as np
+
+from rayfix_service.fusion.locator import Fused
+from rayfix_service.moments import utc_moment
+from rayfix_service.tracking.estimate import Estimate, estimate
+from rayfix_service.tracking.likelihood import likelihood_of
+from rayfix_service.tracking.particles import Particles, birth, mixed, predict, update
+from rayfix_service.tracking.settings import TrackingSettings
+from rayfix_service.tracking.walls import walls_of
+from rayfix_tables.errors import ReportError
+from rayfix_tables.table import Scene
+
+TrackState = Literal["started", "updated", "restarted", "predicted", "late"]
+"""What a report did to its target's track; docs/tracking.md defines each."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackedPosition:
+    """A target's track after a report.
+
+    Attributes
+    ----------
+    state : {"started", "updated", "restarted", "predicted", "late"}
+    timestamp : str
+        Time that the track is of: that of the last report that it was updated or predicted with.
+    num_reports : int
+        Reports since the track's start that said something of the position.
+    estimate : Estimate
+    """
+
+    state: TrackState
+    timestamp: str
+    num_reports: int
+    estimate: Estimate
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Track:
+    """What is kept of a target.
+
+    Attributes
+    ----------
+    seconds : float
+        Time of ``position``, since 1970.
+    touched : float, s
+        When the target was last heard of, by the service's clock.
+    strange : float or None
+        Time of the last report, if it was long before the track.
+    """
+
+    particles: Particles
+    position: TrackedPosition
+    seconds: float
+    touched: float
+    rng: np.random.Generator
+    strange: float | None = None
+
+
+class Tracker:
+    """Follows targets through one building. It may be used from several threads.
+
+    Parameters
+    ----------
+    scene : Scene
+        The table's scene, whose surfaces no target passes.
+    settings : TrackingSettings, optional
+    clock : callable, optional
+        The service's clock, s, by which targets are forgotten; reports have their own times.
+    """
+
+    def __init__(
+        self, scene: Scene, settings: TrackingSettings | None = None, *, clock: Callable[[], float] = monotonic
+    ) -> None:
+        self.settings = settings or TrackingSettings()
+        self._walls = walls_of(scene)
+        self._clock = clock
+        self._tracks: OrderedDict[str, _Track] = OrderedDict()  # the one heard of last comes last
+        self._lock = Lock()
+
+    def __len__(self) -> int:
+        """Return the number of targets."""
+        return len(self._tracks)
+
+    def follow(self, fused: Fused) -> TrackedPosition | None:
+        """Take a report into its target's track, and tell where the target is.
+
+        Returns
+        -------
+        TrackedPosition or None
+            None as long as no report has said anything of the position.
+
+        Raises
+        ------
+        ReportError
+            When the report names no target or no time.
+        """
+        name, timestamp = fused.fix.target_id, fused.fix.timestamp
+        if name is None or timestamp is None:
+            key = "target_id" if name is None else "timestamp"
+            raise ReportError(f"{key} is missing; a target is followed by its target_id and timestamp", path=(key,))
+        with self._lock:
+            now = self._clock()
+            self._forget(now)
+            track = self._after(self._tracks.get(name), name, timestamp, fused, now)
+            if track is None:
+                self._tracks.pop(name, None)
+                return None
+            self._tracks[name] = track
+            self._tracks.move_to_end(name)
+            while len(self._tracks) > self.settings.max_targets:
+                self._tracks.popitem(last=False)
+            return track.position
+
+    def _forget(self, now: float) -> None:
+        """Forget targets not heard of for long."""
+        while self._tracks and now - next(iter(self._tracks.values())).touched > self.settings.max_age:
+            self._tracks.popitem(last=False)
+
+    def _after(self, track: _Track | None, name: str, timestamp: str, fused: Fused, now: float) -> _Track | None:
+        """Return the track after a report, or None where there is none."""
+        seconds = utc_moment(timestamp).timestamp()
+        if track is None:
+            digest = hashlib.sha256(name.encode()).digest()
+            rng = np.random.default_rng([self.settings.seed, *np.frombuffer(digest, np.uint32).tolist()])
+            return self._start("started", timestamp, seconds, fused, now, rng)
+        gap = seconds - track.seconds
+        if gap <= 0.0:
+            # A report that is repeated, or was overtaken. Long before the track, it may be the first after the clock
+            # was set back: the second says so.
+            long_before = gap < -self.settings.longest_gap
+            if long_before and track.strange is not None and 0.0 < seconds - track.strange < self.settings.longest_gap:
+                return self._start("restarted", timestamp, seconds, fused, now, track.rng)
+            late = replace(track.position, state="late")
+            return replace(track, position=late, touched=now, strange=seconds if long_before else track.strange)
+        if gap > self.settings.longest_gap:
+            return self._start("restarted", timestamp, seconds, fused, now, track.rng)
+        return self._go_on(track, timestamp, gap, fused, now)
+
+    def _start(
+        self, state: TrackState, timestamp: str, seconds: float, fused: Fused, now: float, rng: np.random.Generator
+    ) -> _Track | None:
+        particles = self._newborn(fused, rng)
+        if particles is None:
+            return None
+        position = TrackedPosition(state=state, timestamp=timestamp, num_reports=1, estimate=estimate(particles))
+        return _Track(particles=particles, position=position, seconds=seconds, touched=now, rng=rng)
+
+    def _newborn(self, fused: Fused, rng: np.random.Generator) -> Particles | None:
+        """Particles from a report alone."""
+        if not fused.hypotheses:
+            return None
+        settings = self.settings
+        return birth(fused.hypotheses, self._walls.free_space, settings.motion, settings.num_particles, rng)
+
+    def _go_on(self, track: _Track, timestamp: str, gap: float, fused: Fused, now: float) -> _Track | None:
+        settings, rng = self.settings, track.rng
+        num_steps = math.ceil(gap / settings.longest_step)
+        step = gap / num_steps
+        particles: Particles | None = track.particles
+        # The last step is the report's, where it says anything.
+        for _ in range(num_steps - 1 if fused.hypotheses else num_steps):
+            if particles is not None:
+                particles = predict(particles, settings.motion, step, self._walls, rng)
+        state: TrackState = "predicted"
+        if fused.hypotheses:
+            particles, state = self._take_in(particles, fused, step, min(1.0, gap / settings.height_seconds), rng)
+        if particles is None:
+            return None
+        told = 1 if state == "restarted" else track.position.num_reports + (state == "updated")
+        position = TrackedPosition(state=state, timestamp=timestamp, num_reports=told, estimate=estimate(particles))
+        return _Track(particles=particles, position=position, seconds=track.seconds + gap, touched=now, rng=rng)
+
+    def _take_in(
+        self, particles: Particles | None, fused: Fused, step: float, height_share: float, rng: np.random.Generator
+    ) -> tuple[Particles | None, TrackState]:
+        """Update particles, those that could have moved at all, with a report, or begin anew with it."""
+        assert fused.hypotheses is not None
+        updated = None
+        if particles is not None:
+            likelihood = likelihood_of(fused.hypotheses, fused.prior, height_share=height_share)
+            updated = update(particles, likelihood, self.settings.motion, step, self._walls, rng)
+        if updated is None:
+            return self._newborn(fused, rng), "restarted"
+        share = self._restart_share(fused.fix.log_evidence - updated.log_evidence)
+        newborn = self._newborn(fused, rng) if 2.0 * share * self.settings.num_particles > 1.0 else None
+        if newborn is None:
+            return updated.particles, "updated"
+        all_of_both = mixed(updated.particles, newborn, share, rng)
+        return all_of_both, "restarted" if all_of_both is newborn else "updated"
+
+    def _restart_share(self, log_ratio: float) -> float:
+        """Posterior probability that the report begins a new track, given the log ratio of evidence for that."""
+        odds = self.settings.restart_probability / (1.0 - self.settings.restart_probability)
+        return 1.0 / (1.0 + math.exp(min(-log_ratio - math.log(odds), 700.0)))
