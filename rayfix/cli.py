@@ -90,8 +90,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_output_arguments(locate)
     locate.add_argument("--json", action="store_true", help="the answer of the HTTP interface")
 
-    serve = add("serve", _serve, "serve a table over HTTP")
-    serve.add_argument("table", type=Path, metavar="T.h5")
+    serve = add("serve", _serve, "serve a table, or all tables of a folder, over HTTP")
+    serve.add_argument("tables", type=Path, metavar="T.h5|DIR")
     serve.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     serve.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
     serve.add_argument("--workers", type=int, default=1, help="processes that answer (default: 1)")
@@ -263,7 +263,7 @@ def _serve(options: argparse.Namespace) -> int:
     with needs_extra("service"):
         from rayfix_service.http.server import serve
     serve(
-        options.table,
+        options.tables,
         host=options.host,
         port=options.port,
         workers=options.workers,

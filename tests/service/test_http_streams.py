@@ -148,18 +148,18 @@ def test_the_example_of_an_event_is_one():
 def test_a_slow_listener_loses_the_oldest_and_is_told():
     async def listen() -> tuple[int, list[int], bytes]:
         feed = FixFeed()
-        feed.publish("a", unwanted)
-        with feed.subscribe() as slow, feed.subscribe("b") as other:
+        feed.publish("hall", "a", unwanted)
+        with feed.subscribe() as slow, feed.subscribe(target_id="b") as other:
             for _ in range(QUEUE_LENGTH + 3):
-                feed.publish("a", lambda: b"{}")
+                feed.publish("hall", "a", lambda: b"{}")
             dropped, events = slow.take()
             assert slow.take() == (0, [])
             assert other.take() == (0, [])
             assert feed.num_listeners == 2
-            feed.publish("b", lambda: b"{}")
+            feed.publish("hall", "b", lambda: b"{}")
             assert [len(s.take()[1]) for s in (slow, other)] == [1, 1]
         assert feed.num_listeners == 0
-        feed.publish("a", unwanted)
+        feed.publish("hall", "a", unwanted)
         return dropped, [event.number for event in events], events[0].data
 
     def unwanted() -> bytes:
@@ -177,7 +177,7 @@ def test_waiting_ends_with_an_event_with_the_end_and_with_the_time():
         with feed.subscribe() as subscription:
             await subscription.wait(0.001)
             assert subscription.take() == (0, [])
-            asyncio.get_running_loop().call_soon(feed.publish, None, lambda: b"{}")
+            asyncio.get_running_loop().call_soon(feed.publish, "hall", None, lambda: b"{}")
             await subscription.wait(60)
             assert len(subscription.take()[1]) == 1
             asyncio.get_running_loop().call_soon(feed.close)

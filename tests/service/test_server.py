@@ -13,7 +13,7 @@ import pytest
 
 from rayfix_service.http.examples import REPORT_EXAMPLES
 from rayfix_service.http.server import (
-    TABLE_VARIABLE,
+    SERVICE_VARIABLE,
     ServiceError,
     app_from_environment,
     check_address,
@@ -98,8 +98,8 @@ def test_what_cannot_be_served_is_said_first(hall_table_path: Path, tmp_path: Pa
         check_address("no.such.host.invalid", 8000)
     with pytest.raises(ServiceError, match=r"192\.0\.2\.1"):  # an address kept for documentation
         check_address("192.0.2.1", 8000)
-    monkeypatch.delenv(TABLE_VARIABLE, raising=False)
-    with pytest.raises(ServiceError, match=TABLE_VARIABLE):
+    monkeypatch.delenv(SERVICE_VARIABLE, raising=False)
+    with pytest.raises(ServiceError, match=SERVICE_VARIABLE):
         app_from_environment()
 
 

@@ -1,4 +1,4 @@
-"""The web application of one table."""
+"""The web application."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -11,17 +11,16 @@ from pydantic.json_schema import models_json_schema
 
 from rayfix_service.adapters.nrppa_documents import NrppaDocument
 from rayfix_service.adapters.silabs import SilabsDocument
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.http import routes_formats, routes_health, routes_positions, routes_stream, routes_table
-from rayfix_service.http.dependencies import BodyLimits, Service
 from rayfix_service.http.feed import FixFeed
-from rayfix_service.http.metrics import Metrics
+from rayfix_service.http.metrics import Metrics, forget_dead_workers
 from rayfix_service.http.problems import Problem, install_problems
 from rayfix_service.http.request_context import RequestContext
 from rayfix_service.http.routes_stream import FixEventDocument
+from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.stopping import on_stop_signal
+from rayfix_service.http.tables import Tables
 from rayfix_service.wire import BatchDocument, ReportDocument
-from rayfix_tables.table import Table
 
 _DESCRIPTION = """\
 Indoor positions from angles and times of arrival, fused with a digital twin of the building.
@@ -55,33 +54,41 @@ class RayfixApp(FastAPI):
         return self.openapi_schema
 
 
-def create_app(table_path: Path, *, body_limits: BodyLimits | None = None) -> FastAPI:
-    """Make the web application that answers from one table.
+def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> FastAPI:
+    """Make the web application that answers from one table or several.
 
-    At its start it maps the table and listens; ``/livez`` answers. Meanwhile a thread verifies the table and
-    compiles the kernels; then ``/readyz`` turns 200 and the other routes answer.
+    It listens at once; ``/livez`` answers. Meanwhile a thread verifies the tables and compiles the kernels; then
+    ``/readyz`` turns 200 and the other routes answer. Afterwards it watches the tables' files.
 
     Parameters
     ----------
-    table_path : pathlib.Path
-        The table. A file that cannot be opened stops the start; one that does not pass its check leaves the
-        application not ready.
-    body_limits : BodyLimits, optional
-        How long requests may be.
+    tables_path : pathlib.Path
+        The table, or a folder of tables. One that does not pass its check leaves the application not ready.
+    settings : ServiceSettings, optional
     """
+    settings = settings or ServiceSettings()
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        table = Table.open(table_path)
-        app.state.metrics.table_opened(table)
-        app.state.service = Service(Locator(table), on_ready=app.state.metrics.became_ready)
-        preparation = asyncio.create_task(app.state.service.prepare())
+        state = app.state
+        state.tables = tables = Tables(tables_path, state.metrics, runtime_folder=settings.runtime_folder)
+        keeping = asyncio.create_task(tables.keep(settings.watch_seconds))
+        stopping = asyncio.Event()
+
+        def stop() -> None:
+            stopping.set()
+            state.feed.close()
+
         try:
-            with on_stop_signal(app.state.feed.close):
+            with on_stop_signal(stop):
+                if settings.runtime_folder is not None:
+                    forget_dead_workers()
+                    await _take_turn(tables, settings.runtime_folder / "ready", stopping)
                 yield
         finally:
-            app.state.feed.close()
-            await preparation  # its thread would outlive the loop
+            stop()
+            keeping.cancel()
+            await asyncio.wait([keeping])
 
     app = RayfixApp(
         title="rayfix",
@@ -91,7 +98,7 @@ def create_app(table_path: Path, *, body_limits: BodyLimits | None = None) -> Fa
         redoc_url=None,
         redirect_slashes=False,  # a redirected POST loses its body in many clients; a 404 is clear
     )
-    app.state.body_limits = body_limits or BodyLimits()
+    app.state.settings = settings
     app.state.metrics = Metrics()
     app.state.feed = FixFeed()
     install_problems(app)
@@ -102,3 +109,16 @@ def create_app(table_path: Path, *, body_limits: BodyLimits | None = None) -> Fa
     app.include_router(routes_table.router)
     app.include_router(routes_health.router)
     return app
+
+
+async def _take_turn(tables: Tables, marker: Path, stopping: asyncio.Event) -> None:
+    """Let a worker that replaces another listen only once it can locate.
+
+    Until then the others take all connections. Of the first workers none waits, so that ``/livez`` answers; a file in
+    the folder that they share tells that there was one that could locate.
+    """
+    if marker.exists():
+        waiting = [asyncio.create_task(event.wait()) for event in (tables.became_ready, stopping)]
+        await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+        for task in waiting:
+            task.cancel()

@@ -18,6 +18,8 @@ class FixEvent:
     ----------
     number : int
         Counts the events of this process.
+    table : str
+        Name of the table that answered.
     target_id : str or None
         Target of the report.
     data : bytes
@@ -25,6 +27,7 @@ class FixEvent:
     """
 
     number: int
+    table: str
     target_id: str | None
     data: bytes
 
@@ -34,11 +37,12 @@ class Subscription:
 
     Parameters
     ----------
-    target_id : str, optional
-        The only target to hear of.
+    table, target_id : str, optional
+        The only table and the only target to hear of.
     """
 
-    def __init__(self, target_id: str | None = None) -> None:
+    def __init__(self, *, table: str | None = None, target_id: str | None = None) -> None:
+        self._table = table
         self._target_id = target_id
         self._events: deque[FixEvent] = deque(maxlen=QUEUE_LENGTH)
         self._wake = asyncio.Event()
@@ -46,8 +50,8 @@ class Subscription:
         self.closed = False
 
     def put(self, event: FixEvent) -> None:
-        """Queue an event, if it is of the target."""
-        if self._target_id is not None and event.target_id != self._target_id:
+        """Queue an event, if it is of the table and the target."""
+        if self._table not in (None, event.table) or self._target_id not in (None, event.target_id):
             return
         self._dropped += len(self._events) == QUEUE_LENGTH
         self._events.append(event)
@@ -90,9 +94,9 @@ class FixFeed:
         return len(self._subscriptions)
 
     @contextmanager
-    def subscribe(self, target_id: str | None = None) -> Iterator[Subscription]:
-        """Listen to all targets, or to one."""
-        subscription = Subscription(target_id)
+    def subscribe(self, *, table: str | None = None, target_id: str | None = None) -> Iterator[Subscription]:
+        """Listen to all fixes, or to those of one table or target."""
+        subscription = Subscription(table=table, target_id=target_id)
         if self._closed:
             subscription.close()
         self._subscriptions.add(subscription)
@@ -101,12 +105,12 @@ class FixFeed:
         finally:
             self._subscriptions.remove(subscription)
 
-    def publish(self, target_id: str | None, make_data: Callable[[], bytes]) -> None:
+    def publish(self, table: str, target_id: str | None, make_data: Callable[[], bytes]) -> None:
         """Tell of a fix; its JSON is only made where someone listens."""
         if not self._subscriptions:
             return
         self._count += 1
-        event = FixEvent(number=self._count, target_id=target_id, data=make_data())
+        event = FixEvent(number=self._count, table=table, target_id=target_id, data=make_data())
         for subscription in self._subscriptions:
             subscription.put(event)
 

@@ -14,12 +14,12 @@ from starlette.requests import HTTPConnection
 
 from rayfix_service.adapters.adapted import Adapted, error_in_message
 from rayfix_service.adapters.formats import OutputFormat, write
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import Fix, Report
-from rayfix_service.http.dependencies import LocatorDep
+from rayfix_service.http.dependencies import TableDep
 from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.metrics import Metrics
 from rayfix_service.http.problems import internal_problem, report_problem
+from rayfix_service.http.tables import ServedTable
 from rayfix_service.wire import fix_to_document, parse_report, report_to_document
 from rayfix_tables.errors import ReportError
 
@@ -74,9 +74,9 @@ def foreign(adapted: Adapted) -> Incoming:
 
 @dataclass(frozen=True, kw_only=True)
 class Answerer:
-    """What answers reports: the locator, the figures that it adds to, and the feed that it tells."""
+    """What answers reports: a table, the figures that it adds to, and the feed that it tells."""
 
-    locator: Locator
+    table: ServedTable
     metrics: Metrics
     feed: FixFeed
 
@@ -94,8 +94,8 @@ class Answerer:
             if incoming.adapted is None:
                 raise
             raise error_in_message(error, incoming.adapted) from None
-        self.feed.publish(fix.target_id, partial(self._event, incoming, fix, seconds))
-        return write(fix, output, self.locator.table.site, compute_seconds=seconds, adapted=incoming.adapted)
+        self.feed.publish(self.table.name, fix.target_id, partial(self._event, incoming, fix, seconds))
+        return write(fix, output, self.table.site, compute_seconds=seconds, adapted=incoming.adapted)
 
     async def answer_or_problem(self, make: Callable[[], Incoming], output: OutputFormat) -> dict[str, Any]:
         """Answer one report of several, with a problem where it cannot be used."""
@@ -112,9 +112,9 @@ class Answerer:
         """Locate a report; returns the fix and the time that it took, s."""
         start = perf_counter()
         if len(report.measurements) <= _MEASUREMENTS_ON_LOOP:
-            fix = self.locator.locate(report)
+            fix = self.table.locator.locate(report)
         else:
-            fix = await asyncio.to_thread(self.locator.locate, report)
+            fix = await asyncio.to_thread(self.table.locator.locate, report)
         seconds = perf_counter() - start
         self.metrics.fix_done(fix, seconds)
         return fix, seconds
@@ -122,17 +122,17 @@ class Answerer:
     def _event(self, incoming: Incoming, fix: Fix, seconds: float) -> bytes:
         return to_json(
             {
-                "table": self.locator.table.path.stem,
+                "table": self.table.name,
                 "report": incoming.native_document(),
                 "fix": fix_to_document(fix, seconds),
             }
         )
 
 
-async def get_answerer(connection: HTTPConnection, locator: LocatorDep) -> Answerer:
-    """Return what answers, or end the request with 503."""
+async def get_answerer(connection: HTTPConnection, table: TableDep) -> Answerer:
+    """Return what answers, or end the request."""
     state = connection.app.state
-    return Answerer(locator=locator, metrics=state.metrics, feed=state.feed)
+    return Answerer(table=table, metrics=state.metrics, feed=state.feed)
 
 
 AnswererDep = Annotated[Answerer, Depends(get_answerer)]

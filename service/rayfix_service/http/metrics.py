@@ -1,11 +1,12 @@
 """Figures for Prometheus; docs/operations.md lists them."""
 
 import os
+from pathlib import Path
 from typing import get_args
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.exposition import choose_encoder
-from prometheus_client.multiprocess import MultiProcessCollector
+from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 
 from rayfix_service.fusion.report import Fix, Status
 from rayfix_tables.table import Table
@@ -50,14 +51,22 @@ class Metrics:
         self._measurements = {name: measurements.labels(name) for name in ("used", "outlier", "unused")}
         self._table = Gauge(
             "rayfix_table_info",
-            "1 for the table that answers",
-            ("table_id", "site", "format_version", "software_version"),
+            "1 for each table that answers, 0 for those that did",
+            ("table", "table_id", "site", "format_version", "software_version"),
             registry=self._registry,
-            multiprocess_mode="max",
+            multiprocess_mode="livemax",
         )
+        loads = Counter(
+            "rayfix_table_loads",
+            "Tables loaded and refused, at the start and since",
+            ("outcome",),
+            registry=self._registry,
+        )
+        self._loads = {outcome: loads.labels(outcome) for outcome in ("loaded", "refused")}
         self._ready = Gauge(
-            "rayfix_ready", "1 once the service can locate", registry=self._registry, multiprocess_mode="min"
+            "rayfix_ready", "1 once the service can locate", registry=self._registry, multiprocess_mode="livemin"
         )
+        self._ready.set(0)
         ProcessCollector(registry=self._registry)
 
     def request_done(self, route: str, method: str, status: str, seconds: float) -> None:
@@ -74,11 +83,18 @@ class Metrics:
             name = "unused" if not outcome.used else "outlier" if (outcome.outlier_probability or 0) > 0.5 else "used"
             self._measurements[name].inc()
 
-    def table_opened(self, table: Table) -> None:
-        """Tell which table answers."""
-        names = (table.table_id, table.site.name, str(table.format_version), table.software_version)
-        self._table.labels(*names).set(1)
-        self._ready.set(0)
+    def table_loaded(self, name: str, table: Table) -> None:
+        """Tell that a table answers."""
+        self._table.labels(*_table_labels(name, table)).set(1)
+        self._loads["loaded"].inc()
+
+    def table_left(self, name: str, table: Table) -> None:
+        """Tell that a table does no longer answer."""
+        self._table.labels(*_table_labels(name, table)).set(0)
+
+    def table_refused(self) -> None:
+        """Tell that a table did not pass its check."""
+        self._loads["refused"].inc()
 
     def became_ready(self) -> None:
         """Tell that the service can locate."""
@@ -98,3 +114,27 @@ class Metrics:
             MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
         encode, media_type = choose_encoder(accept)
         return encode(registry), media_type
+
+
+def _table_labels(name: str, table: Table) -> tuple[str, ...]:
+    return (name, table.table_id, table.site.name, str(table.format_version), table.software_version)
+
+
+def forget_dead_workers() -> None:
+    """Take out of the shared folder what processes that have ended said of the present."""
+    folder = os.environ.get(MULTIPROCESS_VARIABLE)
+    if folder is None:
+        return
+    for pid in {path.stem.rpartition("_")[2] for path in Path(folder).glob("gauge_live*.db")}:
+        if not _is_alive(int(pid)):
+            mark_process_dead(pid, folder)  # type: ignore[no-untyped-call]
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # alive, and another user's
+        pass
+    return True

@@ -19,6 +19,7 @@ from rayfix_service.http.problems import (
     INVALID_REPORT,
     MALFORMED_JSON,
     MEDIA_TYPE,
+    NOT_FOUND,
     NOT_READY,
     UNSUPPORTED_MEDIA_TYPE,
     problem_responses,
@@ -127,7 +128,9 @@ NATIVE_ANSWER = _examples(FIX_EXAMPLE)
 ADAPTED_ANSWER = _examples(ADAPTED_FIX_EXAMPLE)
 """The answer to a message of another format, for the OpenAPI document."""
 
-POSITION_PROBLEMS = problem_responses(MALFORMED_JSON, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE, INVALID_REPORT, NOT_READY)
+POSITION_PROBLEMS = problem_responses(
+    MALFORMED_JSON, NOT_FOUND, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE, INVALID_REPORT, NOT_READY
+)
 """What may go wrong with a report, for the OpenAPI document."""
 
 POSITION_PROBLEMS[INVALID_REPORT.status]["content"][MEDIA_TYPE]["example"] = PROBLEM_EXAMPLE

@@ -38,9 +38,11 @@ MALFORMED_JSON = ProblemKind(status=400, title="Malformed JSON", name="malformed
 CONNECTION_ENDED = ProblemKind(status=400, title="Connection ended", name="connection-ended")
 NOT_FOUND = ProblemKind(status=404, title="Not found", name="not-found")
 METHOD_NOT_ALLOWED = ProblemKind(status=405, title="Method not allowed", name="method-not-allowed")
+TABLE_REFUSED = ProblemKind(status=409, title="Table refused", name="table-refused")
 BODY_TOO_LARGE = ProblemKind(status=413, title="Body too large", name="body-too-large")
 UNSUPPORTED_MEDIA_TYPE = ProblemKind(status=415, title="Unsupported media type", name="unsupported-media-type")
 INVALID_REPORT = ProblemKind(status=422, title="Report cannot be used", name="invalid-report")
+INVALID_PARAMETER = ProblemKind(status=422, title="Parameter cannot be used", name="invalid-parameter")
 INTERNAL_ERROR = ProblemKind(status=500, title="Internal error", name="internal-error")
 NOT_READY = ProblemKind(status=503, title="Not ready", name="not-ready")
 
@@ -48,9 +50,11 @@ KINDS = (
     MALFORMED_JSON,
     NOT_FOUND,
     METHOD_NOT_ALLOWED,
+    TABLE_REFUSED,
     BODY_TOO_LARGE,
     UNSUPPORTED_MEDIA_TYPE,
     INVALID_REPORT,
+    INVALID_PARAMETER,
     INTERNAL_ERROR,
     NOT_READY,
 )
@@ -80,9 +84,17 @@ class Problem(BaseModel):
 class ProblemError(Exception):
     """Ends a request with a problem."""
 
-    def __init__(self, kind: ProblemKind, detail: str, *, headers: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        kind: ProblemKind,
+        detail: str,
+        *,
+        errors: Iterable[FieldProblem] = (),
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
         super().__init__(detail)
         self.kind = kind
+        self.errors = tuple(errors)
         self.headers = headers
 
 
@@ -123,7 +135,7 @@ def problem_responses(*kinds: ProblemKind) -> dict[int | str, dict[str, Any]]:
 
 async def _answer_problem(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, ProblemError)
-    return problem_response(problem_document(error.kind, str(error)), error.headers)
+    return problem_response(problem_document(error.kind, str(error), error.errors), error.headers)
 
 
 async def _answer_report(request: Request, error: Exception) -> JSONResponse:
@@ -138,7 +150,7 @@ async def _answer_validation(request: Request, error: Exception) -> JSONResponse
         FieldProblem(path=tuple(e["loc"][1:]), message=f"{path_text(tuple(e['loc'][1:]))}: {e['msg']}")
         for e in error.errors()
     ]
-    return problem_response(problem_document(INVALID_REPORT, errors[0].message, errors))
+    return problem_response(problem_document(INVALID_PARAMETER, errors[0].message, errors))
 
 
 async def _answer_http(request: Request, error: Exception) -> JSONResponse:

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, Field
 
-from rayfix_service.http.dependencies import LocatorDep
+from rayfix_service.http.dependencies import TablesDep
 from rayfix_service.http.problems import NOT_READY, problem_responses
 
 router = APIRouter(tags=["health"])
@@ -18,11 +18,18 @@ class Alive(BaseModel):
     status: Literal["alive"] = "alive"
 
 
+class ReadyTable(BaseModel):
+    """A table that answers."""
+
+    name: str
+    table_id: str = Field(description="SHA-256 of the table's content")
+
+
 class Ready(BaseModel):
-    """The table is checked and the kernels are compiled."""
+    """All tables are checked and the kernels are compiled."""
 
     status: Literal["ready"] = "ready"
-    table_id: str = Field(description="SHA-256 of the table's content")
+    tables: list[ReadyTable]
 
 
 @router.get("/livez", summary="Does the process answer?")
@@ -32,9 +39,9 @@ async def livez() -> Alive:
 
 
 @router.get("/readyz", summary="Can it locate?", responses=problem_responses(NOT_READY))
-async def readyz(locator: LocatorDep) -> Ready:
-    """Answer 200 once the table is checked and the kernels are compiled, and 503 before."""
-    return Ready(table_id=locator.table.table_id)
+async def readyz(tables: TablesDep) -> Ready:
+    """Answer 200 once all tables are checked and the kernels are compiled, and 503 before."""
+    return Ready(tables=[ReadyTable(name=t.name, table_id=t.locator.table.table_id) for t in tables.all()])
 
 
 @router.get("/metrics", summary="Figures for Prometheus", response_class=PlainTextResponse)

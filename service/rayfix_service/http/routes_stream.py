@@ -11,12 +11,19 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 from starlette.websockets import WebSocketDisconnect
 
-from rayfix_service.http.dependencies import LocatorDep, report_limit
+from rayfix_service.http.dependencies import TablesDep, report_limit
 from rayfix_service.http.examples import FIX_EVENT_EXAMPLE
 from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.locating import AnswererDep, native
 from rayfix_service.http.outputs import Output
-from rayfix_service.http.problems import BODY_TOO_LARGE, INVALID_REPORT, NOT_READY, problem_document, problem_responses
+from rayfix_service.http.problems import (
+    BODY_TOO_LARGE,
+    INVALID_PARAMETER,
+    NOT_FOUND,
+    NOT_READY,
+    problem_document,
+    problem_responses,
+)
 from rayfix_service.wire import FixDocument, ReportDocument
 
 router = APIRouter(prefix="/v1", tags=["streams"])
@@ -59,25 +66,29 @@ class EventStreamResponse(StreamingResponse):
                 }
             },
         },
-        **problem_responses(INVALID_REPORT, NOT_READY),
+        **problem_responses(INVALID_PARAMETER, NOT_FOUND, NOT_READY),
     },
 )
 async def get_fixes(
     request: Request,
-    locator: LocatorDep,
+    tables: TablesDep,
+    table: Annotated[str | None, Query(description="the only table to hear of")] = None,
     target_id: Annotated[str | None, Query(description="the only target to hear of", max_length=256)] = None,
 ) -> EventStreamResponse:
     """Tell of every fix that the service makes from now on, by whichever route its report came."""
+    tables.all()  # none answers before it is ready
+    if table is not None:
+        tables.named(table)
     return EventStreamResponse(
-        _events(request.app.state.feed, target_id),
+        _events(request.app.state.feed, table, target_id),
         # A proxy that gathers answers before it passes them on would gather these for ever.
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
 
 
-async def _events(feed: FixFeed, target_id: str | None) -> AsyncIterator[bytes]:
+async def _events(feed: FixFeed, table: str | None, target_id: str | None) -> AsyncIterator[bytes]:
     """Write the events of a feed."""
-    with feed.subscribe(target_id) as subscription:
+    with feed.subscribe(table=table, target_id=target_id) as subscription:
         yield b"retry: %d\n\n" % _RETRY_MILLISECONDS
         while True:
             await subscription.wait(HEARTBEAT_SECONDS)

@@ -5,9 +5,17 @@ import math
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
-from rayfix_service.http.dependencies import LocatorDep
-from rayfix_service.http.problems import NOT_READY, problem_responses
-from rayfix_service.wire import Point
+from rayfix_service.http.dependencies import TableDep, TablesDep
+from rayfix_service.http.problems import (
+    INVALID_PARAMETER,
+    NOT_FOUND,
+    NOT_READY,
+    TABLE_REFUSED,
+    ProblemError,
+    problem_responses,
+)
+from rayfix_service.http.tables import Change, ServedTable
+from rayfix_service.wire import FieldProblem, Point
 from rayfix_tables.level import Level
 from rayfix_tables.site import Station
 
@@ -23,14 +31,34 @@ class SiteSummary(BaseModel):
 
 
 class TableSummary(BaseModel):
-    """The table that answers."""
+    """A table that answers."""
 
+    name: str = Field(description="name of its file without the suffix; for the query parameter table")
     table_id: str = Field(description="SHA-256 of the table's content")
     format_version: int
     software_version: str = Field(description="version of rayfix that built the table")
     site: SiteSummary
     num_stations: int
     num_components: int = Field(description="Gaussian components over all stations and levels")
+
+
+class TableList(BaseModel):
+    """The tables that answer."""
+
+    tables: list[TableSummary]
+
+
+class ReloadedTable(BaseModel):
+    """What became of a table."""
+
+    name: str
+    change: Change
+
+
+class Reloaded(BaseModel):
+    """What became of all tables."""
+
+    tables: list[ReloadedTable]
 
 
 class LevelSummary(BaseModel):
@@ -65,12 +93,51 @@ class StationList(BaseModel):
     stations: list[StationSummary]
 
 
-@router.get("/table", summary="The table", responses=problem_responses(NOT_READY))
-async def get_table(locator: LocatorDep) -> TableSummary:
+_ONE_TABLE = problem_responses(INVALID_PARAMETER, NOT_FOUND, NOT_READY)
+
+
+@router.get("/table", summary="The table", responses=_ONE_TABLE)
+async def get_table(table: TableDep) -> TableSummary:
     """Tell which table answers, and which site it was built for."""
-    table = locator.table
+    return _table(table)
+
+
+@router.get("/tables", summary="All tables", responses=problem_responses(NOT_READY))
+async def get_tables(tables: TablesDep) -> TableList:
+    """List the tables that answer."""
+    return TableList(tables=[_table(table) for table in tables.all()])
+
+
+@router.post("/tables/reload", summary="Load new tables", responses=problem_responses(TABLE_REFUSED))
+async def post_reload(tables: TablesDep) -> Reloaded:
+    """Look at the tables' files now: load what is new and drop what is gone.
+
+    A new file is verified first, while the table that it replaces answers; one that does not pass is refused with 409,
+    and the table that it was to replace goes on answering. Other worker processes follow within seconds.
+    """
+    changes = await tables.reload()
+    refused = [change for change in changes if change.change == "refused"]
+    if refused:
+        raise ProblemError(
+            TABLE_REFUSED,
+            f"{refused[0].reason}; what answered before answers on",
+            errors=[FieldProblem(path=(change.name,), message=change.reason or "") for change in refused],
+        )
+    return Reloaded(tables=[ReloadedTable(name=change.name, change=change.change) for change in changes])
+
+
+@router.get("/stations", summary="The stations", responses=_ONE_TABLE)
+async def get_stations(served: TableDep) -> StationList:
+    """List the stations that reports may name, with their levels in the table."""
+    table = served.locator.table
+    return StationList(stations=[_station(s, table.levels(s.id)) for s in table.site.stations])
+
+
+def _table(served: ServedTable) -> TableSummary:
+    table = served.locator.table
     stations = table.site.stations
     return TableSummary(
+        name=served.name,
         table_id=table.table_id,
         format_version=table.format_version,
         software_version=table.software_version,
@@ -82,13 +149,6 @@ async def get_table(locator: LocatorDep) -> TableSummary:
         num_stations=len(stations),
         num_components=sum(level.num_components for s in stations for level in table.levels(s.id)),
     )
-
-
-@router.get("/stations", summary="The stations", responses=problem_responses(NOT_READY))
-async def get_stations(locator: LocatorDep) -> StationList:
-    """List the stations that reports may name, with their levels in the table."""
-    table = locator.table
-    return StationList(stations=[_station(s, table.levels(s.id)) for s in table.site.stations])
 
 
 def _station(station: Station, levels: tuple[Level, ...]) -> StationSummary:

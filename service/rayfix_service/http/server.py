@@ -1,24 +1,31 @@
-"""Serve a table over HTTP."""
+"""Serve tables over HTTP."""
 
 import os
 import socket
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import NamedTemporaryFile, TemporaryDirectory
 
 import uvicorn
 from fastapi import FastAPI
+from pydantic import TypeAdapter
 
 from rayfix_service.http.app import create_app
 from rayfix_service.http.logs import LogFormat, log_config
 from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE
+from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.http.tables import TableFiles
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table
 
-TABLE_VARIABLE = "RAYFIX_TABLE"
-"""Environment variable that tells worker processes the table's path."""
+SERVICE_VARIABLE = "RAYFIX_SERVICE"
+"""Environment variable that tells worker processes what to serve, as JSON."""
 
 _MAX_MESSAGE = 16 << 20  # bytes; up to here a message that is too long is answered, beyond it ends the connection
+_HANGING_SECONDS = 30  # a worker that is silent for so long is replaced; a kernel may keep it silent for some
+_FIGURES_BYTES = 8 << 20  # of some workers
 _SHUTDOWN_SECONDS = 10  # for requests under way; a full batch takes about one
 
 
@@ -27,20 +34,21 @@ class ServiceError(RayfixError):
 
 
 def serve(
-    table_path: str | Path,
+    tables_path: str | Path,
     *,
     host: str = "127.0.0.1",
     port: int = 8000,
     workers: int = 1,
     log_format: LogFormat = "text",
     access_log: bool = False,
+    settings: ServiceSettings | None = None,
 ) -> None:
-    """Serve a table until the process is told to end (SIGINT, SIGTERM); requests under way are finished.
+    """Serve tables until the process is told to end (SIGINT, SIGTERM); requests under way are finished.
 
     Parameters
     ----------
-    table_path : str or pathlib.Path
-        The table.
+    tables_path : str or pathlib.Path
+        A table, or a folder of tables ``*.h5``.
     host : str
         Name or address to listen on; ``0.0.0.0`` is every IPv4 interface.
     port : int
@@ -51,29 +59,32 @@ def serve(
         JSON is an object a line.
     access_log : bool
         Whether to log a line per request. It costs more than it tells, with a hundred targets at 5 Hz.
+    settings : ServiceSettings, optional
 
     Raises
     ------
     TableError
-        When the table is missing, of another format, or damaged.
+        When a table is missing, of another format, or damaged.
     ServiceError
-        When the port is taken, or an argument is out of range.
+        When the port is taken, an argument is out of range, or the folder for figures cannot be written to.
     """
-    path = Path(table_path).absolute()
+    path = Path(tables_path).absolute()
+    settings = settings or ServiceSettings()
     if workers < 1:
         raise ServiceError(f"workers is {workers}; give at least 1")
-    Table.open(path).verify()
+    for table_path in TableFiles(path=path).find().values():
+        Table.open(table_path).verify()
     check_address(host, port)
     with ExitStack() as stack:
-        app: str | FastAPI = f"{__name__}:{app_from_environment.__name__}"
+        app: str | FastAPI
         if workers > 1:
-            os.environ[TABLE_VARIABLE] = str(path)
-            if MULTIPROCESS_VARIABLE not in os.environ:
-                # Where the workers share their figures; whichever is asked answers for all.
-                os.environ[MULTIPROCESS_VARIABLE] = stack.enter_context(TemporaryDirectory(prefix="rayfix-metrics-"))
-                stack.callback(os.environ.pop, MULTIPROCESS_VARIABLE)
+            settings = replace(settings, runtime_folder=stack.enter_context(_runtime_folder()))
+            stack.enter_context(_environment(SERVICE_VARIABLE, _Service(path, settings).to_json()))
+            app = f"{__name__}:{app_from_environment.__name__}"
         else:
-            app = create_app(path)
+            app = create_app(path, settings)
+        if MULTIPROCESS_VARIABLE in os.environ:
+            _check_room(Path(os.environ[MULTIPROCESS_VARIABLE]))
         uvicorn.run(
             app,
             factory=workers > 1,
@@ -83,23 +94,78 @@ def serve(
             ws_max_size=_MAX_MESSAGE,
             ws_per_message_deflate=False,  # costs more than it saves, on messages of a kilobyte
             timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
+            timeout_worker_healthcheck=_HANGING_SECONDS,
             access_log=False,  # this package has one of its own
             log_config=log_config(log_format, access_log=access_log),
         )
 
 
+@dataclass(frozen=True)
+class _Service:
+    """What a worker process must know."""
+
+    tables_path: Path
+    settings: ServiceSettings
+
+    def to_json(self) -> str:
+        return TypeAdapter(_Service).dump_json(self).decode()
+
+
 def app_from_environment() -> FastAPI:
-    """Make the application in a worker process, from the table that the environment names.
+    """Make the application in a worker process, of what the environment says.
 
     Raises
     ------
     ServiceError
-        When it names none.
+        When it says nothing.
     """
-    path = os.environ.get(TABLE_VARIABLE)
-    if not path:
-        raise ServiceError(f"the environment variable {TABLE_VARIABLE} is not set; set it to a table's path")
-    return create_app(Path(path))
+    text = os.environ.get(SERVICE_VARIABLE)
+    if not text:
+        raise ServiceError(f"the environment variable {SERVICE_VARIABLE} is not set; start workers by serve()")
+    service = TypeAdapter(_Service).validate_json(text)
+    return create_app(service.tables_path, service.settings)
+
+
+@contextmanager
+def _runtime_folder() -> Iterator[Path]:
+    """Make the folder that workers share, with a place for their figures unless the environment names one."""
+    try:
+        folder = TemporaryDirectory(prefix="rayfix-")
+    except OSError as error:
+        raise ServiceError(
+            f"the workers need a temporary folder and there is none ({error.strerror}); set TMPDIR to one"
+        ) from None
+    with folder as name, ExitStack() as stack:
+        if MULTIPROCESS_VARIABLE not in os.environ:
+            # Whichever worker is asked answers for all.
+            (Path(name) / "metrics").mkdir()
+            stack.enter_context(_environment(MULTIPROCESS_VARIABLE, str(Path(name) / "metrics")))
+        yield Path(name)
+
+
+@contextmanager
+def _environment(variable: str, value: str) -> Iterator[None]:
+    """Set an environment variable for a while."""
+    os.environ[variable] = value
+    try:
+        yield
+    finally:
+        del os.environ[variable]
+
+
+def _check_room(folder: Path) -> None:
+    """Check that workers can write their figures.
+
+    They map sparse files there: where there is no room, the first page that lacks ends the process with a signal.
+    """
+    try:
+        with NamedTemporaryFile(dir=folder, prefix="rayfix-") as file:
+            os.posix_fallocate(file.fileno(), 0, _FIGURES_BYTES)
+    except OSError as error:
+        raise ServiceError(
+            f"{MULTIPROCESS_VARIABLE} is {folder}, where figures cannot be written ({error.strerror}); "
+            "make room there or give another folder"
+        ) from None
 
 
 def check_address(host: str, port: int) -> None:
