@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types package accuracy clean
+.PHONY: viewer browser screenshots demo test lint types package accuracy clean
 
 # The environment is made anew when what it holds has changed.
 $(VENV)/.done: pyproject.toml constraints.txt
@@ -10,11 +10,28 @@ $(VENV)/.done: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
+# The viewer's files, which the service gives at / and packages hold. Where there is no npm, the service does without.
+FRONTEND := service/rayfix_service/web/frontend
+VIEWER := service/rayfix_service/web/static/index.html
+
+viewer: $(VIEWER)
+
+$(VIEWER): $(wildcard $(FRONTEND)/*.*) $(shell find $(FRONTEND)/src -type f)
+	@if command -v npm >/dev/null; then \
+		cd $(FRONTEND) && npm ci --no-progress && npm run build; \
+	else \
+		echo "there is no npm: the viewer is not built; install Node.js 20.19 or later"; \
+	fi
+
 demo: $(VENV)/.done
 	$(BIN)/rayfix demo --output demo
 
 test: $(VENV)/.done
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --ignore tests/browser
+
+# In a real browser; what it showed is kept in browser-artefacts/.
+browser: $(VENV)/.done viewer
+	$(BIN)/python -m pytest tests/browser
 
 lint: $(VENV)/.done
 	$(BIN)/ruff format --check .
@@ -24,7 +41,7 @@ types: $(VENV)/.done
 	$(BIN)/mypy
 
 # The wheel, in an environment of its own and outside the checkout, runs the demo.
-package: $(VENV)/.done
+package: $(VENV)/.done viewer
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
 	$(BIN)/python tests/package/check_wheel.py dist
@@ -33,4 +50,4 @@ accuracy: $(VENV)/.done
 	$(BIN)/python benchmarks/accuracy.py
 
 clean:
-	rm -rf $(VENV) dist demo .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) dist demo browser-artefacts $(dir $(VIEWER)) $(FRONTEND)/node_modules .pytest_cache .mypy_cache .ruff_cache

@@ -97,6 +97,11 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--workers", type=int, default=1, help="processes that answer (default: 1)")
     serve.add_argument("--log-format", choices=("text", "json"), default="text", help="of the log (default: text)")
     serve.add_argument("--access-log", action="store_true", help="log a line per request")
+    serve.add_argument(
+        "--allow-simulation",
+        action="store_true",
+        help="let the viewer simulate reports (on a loopback address it always may)",
+    )
 
     mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: angles of Silicon Labs locators in, positions out")
     mqtt.add_argument("table", type=Path, metavar="T.h5")
@@ -261,7 +266,8 @@ def _locate(options: argparse.Namespace) -> int:
 
 def _serve(options: argparse.Namespace) -> int:
     with needs_extra("service"):
-        from rayfix_service.http.server import serve
+        from rayfix_service.http.server import is_loopback, serve
+        from rayfix_service.http.settings import ServiceSettings
     serve(
         options.tables,
         host=options.host,
@@ -269,6 +275,7 @@ def _serve(options: argparse.Namespace) -> int:
         workers=options.workers,
         log_format=options.log_format,
         access_log=options.access_log,
+        settings=ServiceSettings(simulation=options.allow_simulation or is_loopback(options.host)),
     )
     return 0
 

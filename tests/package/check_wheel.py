@@ -7,6 +7,7 @@ alone it answers a report from the demo's table, and neither trimesh nor scikit-
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -39,7 +40,35 @@ def main() -> None:
                 sys.exit(f"the service's environment has {module}")
         answer = run(work, service / "rayfix", "locate", "demo/hall.h5", "demo/report.json", "--json")
         print(f"located without the offline extra: {json.loads(answer)['position']}")
-        run(work, service / "python", "-c", "from rayfix_service.http.app import create_app")
+        check_viewer(work, service / "python")
+
+
+PAGE = """
+import asyncio, httpx, pathlib
+from rayfix_service.http.app import create_app
+from rayfix_service.web.assets import load_assets
+
+async def main():
+    app = create_app(pathlib.Path("demo/hall.h5"))
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test") as client:
+        page = await client.get("/")
+        files = [await client.get(name) for name in load_assets() if name != "index.html"]
+    print(page.status_code, "assets/" in page.text, len(files), all(f.status_code == 200 for f in files))
+
+asyncio.run(main())
+"""
+
+
+def check_viewer(folder: Path, python: Path) -> None:
+    """Ask the installed service for its viewer."""
+    subprocess.run([str(python), "-m", "pip", "install", "--quiet", "httpx"], check=True)
+    answer = run(folder, python, "-c", PAGE).strip()
+    if answer == "200 True 2 True":
+        print("the wheel has the viewer")
+    elif shutil.which("npm") is None:
+        print("the wheel has NO viewer, since there is no npm here")
+    else:
+        sys.exit(f"the wheel's viewer is not whole: {answer}")
 
 
 def install(folder: Path, wheel: Path, extra: str) -> Path:

@@ -20,6 +20,9 @@ from rayfix_service.http.routes_stream import FixEventDocument
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.stopping import on_stop_signal
 from rayfix_service.http.tables import Tables
+from rayfix_service.web import routes_assets, routes_scene, routes_simulation
+from rayfix_service.web.documents import SimulationRequest
+from rayfix_service.web.per_table import PerTable
 from rayfix_service.wire import BatchDocument, ReportDocument
 
 _DESCRIPTION = """\
@@ -45,6 +48,7 @@ class RayfixApp(FastAPI):
                     (NrppaDocument, "validation"),
                     (SilabsDocument, "validation"),
                     (FixEventDocument, "validation"),
+                    (SimulationRequest, "validation"),
                     (Problem, "serialization"),
                 ],
                 ref_template="#/components/schemas/{model}",
@@ -99,6 +103,7 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
         redirect_slashes=False,  # a redirected POST loses its body in many clients; a 404 is clear
     )
     app.state.settings = settings
+    app.state.per_table = PerTable()
     app.state.metrics = Metrics()
     app.state.feed = FixFeed()
     install_problems(app)
@@ -108,6 +113,9 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
     app.include_router(routes_stream.router)
     app.include_router(routes_table.router)
     app.include_router(routes_health.router)
+    app.include_router(routes_scene.router)
+    app.include_router(routes_simulation.router)
+    app.include_router(routes_assets.router)
     return app
 
 

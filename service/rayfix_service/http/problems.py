@@ -36,6 +36,7 @@ class ProblemKind:
 
 MALFORMED_JSON = ProblemKind(status=400, title="Malformed JSON", name="malformed-json")
 CONNECTION_ENDED = ProblemKind(status=400, title="Connection ended", name="connection-ended")
+FORBIDDEN = ProblemKind(status=403, title="Forbidden", name="forbidden")
 NOT_FOUND = ProblemKind(status=404, title="Not found", name="not-found")
 METHOD_NOT_ALLOWED = ProblemKind(status=405, title="Method not allowed", name="method-not-allowed")
 TABLE_REFUSED = ProblemKind(status=409, title="Table refused", name="table-refused")
@@ -48,6 +49,7 @@ NOT_READY = ProblemKind(status=503, title="Not ready", name="not-ready")
 
 KINDS = (
     MALFORMED_JSON,
+    FORBIDDEN,
     NOT_FOUND,
     METHOD_NOT_ALLOWED,
     TABLE_REFUSED,

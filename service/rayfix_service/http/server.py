@@ -1,5 +1,6 @@
 """Serve tables over HTTP."""
 
+import ipaddress
 import os
 import socket
 from collections.abc import Iterator
@@ -166,6 +167,14 @@ def _check_room(folder: Path) -> None:
             f"{MULTIPROCESS_VARIABLE} is {folder}, where figures cannot be written ({error.strerror}); "
             "make room there or give another folder"
         ) from None
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches what listens there."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def check_address(host: str, port: int) -> None:

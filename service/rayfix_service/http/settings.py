@@ -21,10 +21,13 @@ class ServiceSettings:
     body_limits : BodyLimits
     watch_seconds : float
         Time between two looks at the files of the tables.
+    simulation : bool
+        Whether ``POST /v1/simulations`` answers.
     runtime_folder : pathlib.Path, optional
         Folder that the workers of one service share; none for a single process.
     """
 
     body_limits: BodyLimits = field(default_factory=BodyLimits)
     watch_seconds: float = 2.0
+    simulation: bool = False
     runtime_folder: Path | None = None

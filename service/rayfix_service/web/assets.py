@@ -1,0 +1,83 @@
+"""The viewer's built files, as they go over the wire.
+
+``make viewer`` builds them into ``static/``; a wheel has them. They are small and few, so they are read once and kept,
+compressed as well.
+"""
+
+import gzip
+import hashlib
+import mimetypes
+from dataclasses import dataclass
+from pathlib import Path
+
+STATIC = Path(__file__).with_name("static")
+"""Where the built files are."""
+
+INDEX = "index.html"
+
+CONTENT_SECURITY_POLICY = "; ".join(
+    [
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self'",
+        "img-src 'self' data:",
+        "connect-src 'self'",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    ]
+)
+"""The page runs its own files and talks to its own service, nothing else."""
+
+SECURITY_HEADERS = {
+    "Content-Security-Policy": CONTENT_SECURITY_POLICY,
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+_FOREVER = "public, max-age=31536000, immutable"
+_COMPRESSIBLE = {".html", ".js", ".css", ".svg", ".json"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asset:
+    """A file.
+
+    Attributes
+    ----------
+    body, compressed : bytes
+        The file, and what gzip makes of it; None where that does not pay.
+    media_type : str
+    cache_control : str
+        For good where the name has a hash of the content in it.
+    tag : str
+        Entity tag.
+    """
+
+    body: bytes
+    compressed: bytes | None
+    media_type: str
+    cache_control: str
+    tag: str
+
+
+def load_assets(folder: Path = STATIC) -> dict[str, Asset]:
+    """Read the built files, by their path below the folder; none where the viewer is not built."""
+    if not (folder / INDEX).is_file():
+        return {}
+    return {path.relative_to(folder).as_posix(): _load(path) for path in folder.rglob("*") if path.is_file()}
+
+
+def _load(path: Path) -> Asset:
+    body = path.read_bytes()
+    media_type = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
+    if path.suffix == ".js":
+        media_type = "text/javascript"  # whatever the machine's list says
+    return Asset(
+        body=body,
+        compressed=gzip.compress(body, 9, mtime=0) if path.suffix in _COMPRESSIBLE else None,
+        media_type=media_type,
+        cache_control=_FOREVER if path.parent.name == "assets" else "no-cache",
+        tag=f'"{hashlib.sha256(body).hexdigest()[:32]}"',
+    )

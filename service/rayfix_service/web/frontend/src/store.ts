@@ -1,0 +1,94 @@
+/** The fixes that have come, by target, and which of them is looked at. */
+
+import { vec } from "./numeric";
+import type { FixEvent, Vec3 } from "./types";
+
+export interface Target {
+  id: string;
+  latest: FixEvent;
+  /** Positions, the latest last, m. */
+  trail: Vec3[];
+  count: number;
+  /** When the latest came, ms. */
+  seen: number;
+}
+
+const UNNAMED = "(unnamed)";
+const TRAIL = 120;
+const MOST_TARGETS = 500;
+
+export class Store {
+  readonly targets = new Map<string, Target>();
+  selected: Target | null = null;
+  paused = false;
+  total = 0;
+  private readonly fixListeners: ((target: Target) => void)[] = [];
+  private readonly selectListeners: (() => void)[] = [];
+
+  onFix(listener: (target: Target) => void): void {
+    this.fixListeners.push(listener);
+  }
+
+  onSelect(listener: () => void): void {
+    this.selectListeners.push(listener);
+  }
+
+  /** Take a fix in; one that a person asked for is selected. */
+  add(event: FixEvent): void {
+    const live = event.source === "stream";
+    if (live && this.paused) return;
+    const id = event.fix.target_id ?? UNNAMED;
+    this.total += 1;
+    let target = this.targets.get(id);
+    if (target === undefined) {
+      if (this.targets.size >= MOST_TARGETS) this.forgetOldest();
+      target = { id, latest: event, trail: [], count: 0, seen: 0 };
+      this.targets.set(id, target);
+    }
+    // A posted report comes back over the stream, too; it is one fix.
+    const again = live && sameReport(target.latest, event) && target.count > 0;
+    if (again) return;
+    target.latest = event;
+    target.count += 1;
+    target.seen = performance.now();
+    if (event.fix.position !== null) target.trail.push(vec(event.fix.position));
+    if (target.trail.length > TRAIL) target.trail.shift();
+    for (const listener of this.fixListeners) listener(target);
+    if (!live || this.selected === null) this.select(id);
+  }
+
+  select(id: string | null): void {
+    this.selected = id === null ? null : (this.targets.get(id) ?? null);
+    for (const listener of this.selectListeners) listener();
+  }
+
+  /** Select the next or previous target in the order of the list. */
+  step(by: number): void {
+    const ids = this.ordered().map((t) => t.id);
+    if (ids.length === 0) return;
+    const at = this.selected === null ? -1 : ids.indexOf(this.selected.id);
+    this.select(ids[(at + by + ids.length) % ids.length]!);
+  }
+
+  ordered(): Target[] {
+    return [...this.targets.values()].sort((a, b) => a.id.localeCompare(b.id, undefined, { numeric: true }));
+  }
+
+  clear(): void {
+    this.targets.clear();
+    this.select(null);
+    for (const listener of this.fixListeners) listener(null as never);
+  }
+
+  private forgetOldest(): void {
+    const oldest = [...this.targets.values()].reduce((a, b) => (a.seen < b.seen ? a : b));
+    this.targets.delete(oldest.id);
+    if (this.selected === oldest) this.select(null);
+  }
+}
+
+function sameReport(a: FixEvent, b: FixEvent): boolean {
+  if (a.source === "stream" || a.fix.timestamp !== b.fix.timestamp) return false;
+  const [p, q] = [a.fix.position, b.fix.position];
+  return p !== null && q !== null && p.x === q.x && p.y === q.y && p.z === q.z;
+}

@@ -1,0 +1,143 @@
+/** The selected fix in numbers: position, rivals, and each measurement with what is left over of it. */
+
+import { bar, h, replace, swatch } from "../dom";
+import type { ExplainedFix, Residual } from "../residuals";
+import { percent } from "../scene/selection";
+import { hex, theme } from "../theme";
+import type { FixEvent, Point } from "../types";
+
+const MEANING = {
+  ok: "one place is likely",
+  ambiguous: "several places are likely",
+  inconsistent: "the measurements contradict the twin or each other",
+  insufficient: "too little for a position",
+} as const;
+
+const SOURCES = { stream: "live", posted: "posted here", simulated: "simulated", file: "from the file" } as const;
+
+const KINDS: Record<string, string> = { aoa: "angle", pt: "range", toa: "arrival", tdoa: "difference", rssi: "strength" };
+
+export class FixPanel {
+  readonly element = h("section", { className: "block fix" });
+
+  constructor(private readonly onFocus: (place: Point) => void) {}
+
+  show(event: FixEvent | null, explained: ExplainedFix | null): void {
+    if (event === null) {
+      replace(
+        this.element,
+        h("h2", {}, "Fix"),
+        h("p", { className: "muted" }, "Select a target to see where it may be, and why."),
+      );
+      return;
+    }
+    const { fix } = event;
+    replace(
+      this.element,
+      h(
+        "div",
+        { className: "heading" },
+        h("h2", {}, fix.target_id ?? "(unnamed)"),
+        h("span", { className: `chip ${fix.status}`, title: MEANING[fix.status] }, fix.status),
+      ),
+      h("p", { className: "muted" }, [MEANING[fix.status], SOURCES[event.source]].join(" · ")),
+      fix.timestamp !== null && h("p", { className: "muted number stamp" }, fix.timestamp),
+      fix.position === null ? h("p", {}, "No position.") : this.position(event),
+      fix.candidates.length > 1 && this.rivals(event),
+      this.measurements(explained),
+    );
+  }
+
+  private position(event: FixEvent): HTMLElement {
+    const { fix, truth } = event;
+    const p = fix.position!;
+    const error = truth && Math.hypot(p.x - truth[0], p.y - truth[1], p.z - truth[2]);
+    const row = (name: string, value: string, title = ""): HTMLElement =>
+      h("div", { title }, h("dt", {}, name), h("dd", {}, value));
+    return h(
+      "div",
+      {},
+      h(
+        "button",
+        { type: "button", className: "coordinates", title: "Look there (Enter)", onclick: () => this.onFocus(p) },
+        ...(["x", "y", "z"] as const).map((axis) => h("span", {}, h("small", {}, axis), p[axis].toFixed(2))),
+        h("span", { className: "unit" }, "m"),
+      ),
+      h(
+        "dl",
+        { className: "facts" },
+        row("horizontal", `± ${fix.horizontal_accuracy_m!.toFixed(2)} m`, `with a probability of ${percent(fix.confidence)}`),
+        row("vertical", `± ${fix.vertical_accuracy_m!.toFixed(2)} m`, `with a probability of ${percent(fix.confidence)}`),
+        row("held with", percent(fix.confidence), "probability that the target is within the accuracies"),
+        error === undefined ? row("computed in", `${fix.compute_ms.toFixed(1)} ms`) : row("true error", `${error.toFixed(2)} m`),
+      ),
+    );
+  }
+
+  private rivals(event: FixEvent): HTMLElement {
+    const list = h("ul", { className: "candidates" });
+    event.fix.candidates.slice(0, 8).forEach((candidate, n) => {
+      const p = candidate.position;
+      const apart = event.fix.position!;
+      const distance = Math.hypot(p.x - apart.x, p.y - apart.y, p.z - apart.z);
+      list.append(
+        h(
+          "li",
+          { onclick: () => this.onFocus(p), title: `(${p.x.toFixed(2)}, ${p.y.toFixed(2)}, ${p.z.toFixed(2)}) m` },
+          h("span", {}, n === 0 ? "this fix" : `rival ${n}`),
+          bar(candidate.probability, n === 0 ? "best" : "rival"),
+          h("span", { className: "number" }, percent(candidate.probability)),
+          h("span", { className: "number muted" }, n === 0 ? "" : `${distance.toFixed(1)} m off`),
+        ),
+      );
+    });
+    return h("div", {}, h("h3", {}, "Where it may be"), list);
+  }
+
+  private measurements(explained: ExplainedFix | null): HTMLElement {
+    const rows = h("tbody", {});
+    for (const residual of explained?.residuals ?? []) rows.append(...this.row(residual, explained!));
+    return h(
+      "div",
+      {},
+      h("h3", {}, "Measurements, and how far off the twin is"),
+      h("table", { className: "measurements" }, rows),
+    );
+  }
+
+  private row(residual: Residual, explained: ExplainedFix): HTMLElement[] {
+    const { measurement: m, sigmas } = residual;
+    const path = explained.paths.get(m.station_id);
+    const outlier = residual.outlierProbability ?? 0;
+    const className = !residual.used ? "unused" : outlier > 0.5 ? "outlier" : "";
+    const how = path ? (path.numReflections === 0 ? "direct" : `${path.numReflections} refl.`) : "no path found";
+    const station = m.reference_station_id ? `${m.station_id} − ${m.reference_station_id}` : m.station_id;
+    const meter = h("span", { className: "meter", title: sigmas === null ? "" : `${sigmas.toFixed(1)} standard deviations` });
+    if (sigmas !== null) {
+      const pointer = h("span", { className: sigmas > 3 ? "far" : "" });
+      pointer.style.width = `${Math.min(100, 25 * sigmas).toFixed(0)}%`;
+      meter.append(pointer);
+    }
+    return [
+      h(
+        "tr",
+        { className },
+        h("th", { scope: "row" }, station, h("small", {}, KINDS[m.type] ?? m.type)),
+        h("td", {}, residual.text, h("small", {}, swatchOf(path?.numReflections), how)),
+        h("td", { className: "left" }, residual.difference || "–", meter),
+      ),
+      ...(!residual.used || outlier > 0.05
+        ? [
+            h(
+              "tr",
+              { className: `why ${className}` },
+              h("td", { colSpan: 3 }, residual.used ? `outlier with a probability of ${percent(outlier)}` : `not used: ${residual.reason}`),
+            ),
+          ]
+        : []),
+    ];
+  }
+}
+
+const swatchOf = (reflections: number | undefined): HTMLElement | null =>
+  reflections === undefined ? null : swatch(hex(theme.reflections(reflections)));

@@ -1,0 +1,113 @@
+"""What the table says of one direction, and how far reflections carry: the data of the table inspector."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.directions import in_field_of_view
+from rayfix_service.fusion.heard import HeardStation
+from rayfix_service.fusion.lookup import Direction, look_up
+from rayfix_tables.level import Level
+from rayfix_tables.table import StationPart
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirectionView:
+    """Mixture of a measured direction, as the fusion looks it up.
+
+    Attributes
+    ----------
+    in_field_of_view : bool
+    level_index : int
+        Level that answers, 0 is the finest.
+    window : float, rad
+        Window of that level.
+    cells : ndarray of int64, shape (c,)
+        Cells that are summed; mostly one.
+    centres : ndarray of shape (c, 2), rad
+        Azimuth and zenith of their centres.
+    cell_components : ndarray of int64, shape (c,)
+        Components of each.
+    log_evidence : float
+        Natural logarithm of the density of this direction; -inf where no ray comes from there.
+    probability : ndarray of shape (n,)
+        Share of each component, largest first.
+    position : ndarray of shape (n, 3), m
+    position_cov : ndarray of shape (n, 3, 3), m2
+    path_length : ndarray of shape (n,), m
+    path_length_stdev : ndarray of shape (n,), m
+    num_reflections : ndarray of int64, shape (n,)
+    by_reflections : ndarray of shape (k,)
+        Probability that the path has 0, 1, ... reflections, all components counted.
+    """
+
+    in_field_of_view: bool
+    level_index: int
+    window: float
+    cells: NDArray[np.int64]
+    centres: NDArray[np.float64]
+    cell_components: NDArray[np.int64]
+    log_evidence: float
+    probability: NDArray[np.float64]
+    position: NDArray[np.float64]
+    position_cov: NDArray[np.float64]
+    path_length: NDArray[np.float64]
+    path_length_stdev: NDArray[np.float64]
+    num_reflections: NDArray[np.int64]
+    by_reflections: NDArray[np.float64]
+
+
+def view_direction(part: StationPart, azimuth: float, zenith: float, stdev: float, *, limit: int) -> DirectionView:
+    """Look a direction up and condition its components on it.
+
+    Parameters
+    ----------
+    part : StationPart
+    azimuth, zenith : float, rad
+        In the scene frame.
+    stdev : float, rad
+        Of both angles.
+    limit : int
+        Components that are returned, the most probable ones.
+    """
+    measured = Direction(azimuth=azimuth, zenith=zenith, cov=np.diag([stdev**2, stdev**2]))
+    lookup = look_up(part.levels, measured)
+    heard = HeardStation(part).towards(measured)
+    level = lookup.level
+    begins, ends = level.cell_offsets[lookup.cells], level.cell_offsets[lookup.cells + 1]
+    rows = np.concatenate([np.arange(begin, end) for begin, end in zip(begins, ends, strict=True)])
+    reflections = level.mixture.num_reflections[rows].astype(np.int64)
+    log_evidence = float(np.logaddexp.reduce(heard.log_evidence, initial=-np.inf))
+    share = np.exp(heard.log_evidence - log_evidence) if len(heard) else np.empty(0)
+    top = np.argsort(-share, kind="stable")[:limit]
+    return DirectionView(
+        in_field_of_view=in_field_of_view(part.station, measured),
+        level_index=next(n for n, one in enumerate(part.levels) if one is level),
+        window=level.window,
+        cells=lookup.cells,
+        centres=level.grid.centres[lookup.cells],
+        cell_components=ends - begins,
+        log_evidence=log_evidence,
+        probability=share[top],
+        position=heard.mean[top, :3],
+        position_cov=heard.cov[top, :3, :3],
+        path_length=heard.mean[top, 3],
+        path_length_stdev=np.sqrt(heard.cov[top, 3, 3]),
+        num_reflections=reflections[top],
+        by_reflections=np.bincount(reflections, weights=share).astype(np.float64),
+    )
+
+
+def mass_by_reflections(level: Level) -> NDArray[np.float64]:
+    """Share of a level's mass by the number of reflections of its components, shape (k,), summing to 1.
+
+    The mass of a cell is the integral of its measure: volume of free space, weighted by how probably a UE there is
+    heard from that direction.
+    """
+    counts = np.diff(level.cell_offsets)
+    log_mass = np.repeat(level.cell_log_mass, counts) + level.mixture.log_weight
+    if not len(log_mass):
+        return np.zeros(1)
+    mass = np.bincount(level.mixture.num_reflections.astype(np.int64), weights=np.exp(log_mass - log_mass.max()))
+    return np.asarray(mass / mass.sum())

@@ -1,0 +1,103 @@
+"""Routes of what the viewer shows: the scene, and what the table says of directions."""
+
+import math
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.responses import JSONResponse
+
+from rayfix_service.http.dependencies import TableDep
+from rayfix_service.http.problems import INVALID_PARAMETER, NOT_FOUND, NOT_READY, ProblemError, problem_responses
+from rayfix_service.web.documents import CoverageDocument, MixtureDocument, mixture_document
+from rayfix_service.web.glb import MEDIA_TYPE, write_glb
+from rayfix_service.web.inspector import mass_by_reflections, view_direction
+from rayfix_tables.table import StationPart, Table
+
+router = APIRouter(prefix="/v1", tags=["viewer"])
+
+StationId = Annotated[str, Path(max_length=128, description="the identifier of a station of the table")]
+
+
+@router.get(
+    "/scene.glb",
+    summary="The scene",
+    response_class=Response,
+    responses={200: {"content": {MEDIA_TYPE: {}}}, **problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY)},
+)
+async def get_scene(request: Request, served: TableDep) -> Response:
+    """Give the mesh as binary glTF: metres, y up by the root node's rotation, materials by name."""
+    table = served.locator.table
+    tag = f'"{table.table_id[:32]}"'
+    headers = {"ETag": tag, "Cache-Control": "no-cache"}
+    if request.headers.get("if-none-match") == tag:
+        return Response(status_code=304, headers=headers)
+    body = await request.app.state.per_table.get(
+        table.table_id, "scene.glb", lambda: write_glb(table.scene, table.site.name)
+    )
+    return Response(body, media_type=MEDIA_TYPE, headers=headers)
+
+
+@router.get(
+    "/stations/{station_id}/mixture",
+    summary="The mixture of a direction",
+    response_model=MixtureDocument,
+    responses=problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY),
+)
+async def get_mixture(
+    served: TableDep,
+    station_id: StationId,
+    azimuth_deg: Annotated[float, Query(ge=-180, le=360, allow_inf_nan=False, description="in the scene frame")],
+    zenith_deg: Annotated[float, Query(ge=0, le=180, allow_inf_nan=False, description="in the scene frame")],
+    stdev_deg: Annotated[
+        float, Query(ge=1e-3, le=90, allow_inf_nan=False, description="standard deviation of both angles")
+    ] = 1.0,
+    limit: Annotated[int, Query(ge=1, le=512, description="components to return")] = 64,
+) -> JSONResponse:
+    """Look a measured direction up as the fusion does: level, cells, and the components conditioned on it."""
+    view = view_direction(
+        _part(served.locator.table, station_id),
+        math.remainder(math.radians(azimuth_deg), 2.0 * math.pi),
+        math.radians(zenith_deg),
+        math.radians(stdev_deg),
+        limit=limit,
+    )
+    return JSONResponse(mixture_document(station_id, view))
+
+
+@router.get(
+    "/stations/{station_id}/coverage",
+    summary="How far reflections reach",
+    response_model=CoverageDocument,
+    responses=problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY),
+)
+async def get_coverage(request: Request, served: TableDep, station_id: StationId) -> JSONResponse:
+    """Tell which share of the free space and of each level's mass belongs to how many reflections."""
+    table = served.locator.table
+    part = _part(table, station_id)
+    document = await request.app.state.per_table.get(
+        table.table_id, f"coverage of {station_id}", lambda: _coverage(station_id, part)
+    )
+    return JSONResponse(document)
+
+
+def _coverage(station_id: str, part: StationPart) -> dict[str, object]:
+    return {
+        "station_id": station_id,
+        "coverage": list(part.coverage),
+        "levels": [
+            {
+                "window_deg": round(math.degrees(level.window), 9),
+                "num_cells": level.num_cells,
+                "num_filled_cells": int((level.cell_offsets[1:] > level.cell_offsets[:-1]).sum()),
+                "mass_by_reflections": mass_by_reflections(level).tolist(),
+            }
+            for level in part.levels
+        ],
+    }
+
+
+def _part(table: Table, station_id: str) -> StationPart:
+    part = table.parts.get(station_id)
+    if part is None:
+        raise ProblemError(NOT_FOUND, f"there is no station {station_id!r}; the stations are {', '.join(table.parts)}")
+    return part

@@ -1,0 +1,122 @@
+"""Routes that make reports and show whole posteriors."""
+
+import asyncio
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from fastapi import APIRouter, Request
+from fastapi.responses import JSONResponse
+
+from rayfix_service.fusion.locator import Locator
+from rayfix_service.fusion.report import Report
+from rayfix_service.http.dependencies import ReportBody, TableDep
+from rayfix_service.http.examples import REPORT_EXAMPLES
+from rayfix_service.http.outputs import POSITION_PROBLEMS, request_body
+from rayfix_service.http.problems import (
+    FORBIDDEN,
+    INVALID_PARAMETER,
+    NOT_FOUND,
+    NOT_READY,
+    ProblemError,
+    problem_responses,
+)
+from rayfix_service.web.documents import (
+    PosteriorDocument,
+    SimulationDocument,
+    SimulationRequest,
+    ViewerSettings,
+    parse_simulation,
+    path_document,
+    posterior_document,
+)
+from rayfix_service.web.simulation import simulate
+from rayfix_service.wire import ReportDocument, fix_to_document, parse_report
+from rayfix_tables.table import Table
+
+router = APIRouter(prefix="/v1", tags=["viewer"])
+
+SIMULATION_EXAMPLES = {
+    "in_the_hall": {
+        "summary": "Angles and propagation times of a UE in the hall",
+        "value": {"position": [5.32, 14.2, 0.67], "kinds": ["aoa", "pt"], "angle_stdev_deg": 1.0, "seed": 1},
+    }
+}
+
+_SAMPLES = 1500
+
+_MAX_REFLECTIONS = 3
+"""Of tables whose site does not say."""
+
+
+@router.get(
+    "/viewer", summary="What the viewer may do", responses=problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY)
+)
+async def get_viewer_settings(request: Request, served: TableDep) -> ViewerSettings:
+    """Tell what the service allows the viewer, and how long the paths of its table are."""
+    return viewer_settings(served.locator.table, simulation=request.app.state.settings.simulation)
+
+
+@router.post(
+    "/simulations",
+    summary="Simulate a report and locate it",
+    response_model=SimulationDocument,
+    responses={**POSITION_PROBLEMS, **problem_responses(FORBIDDEN)},
+    openapi_extra=request_body(SimulationRequest, SIMULATION_EXAMPLES),
+)
+async def post_simulation(request: Request, served: TableDep, body: ReportBody) -> JSONResponse:
+    """Measure a UE at a position as the table has it, with noise, and locate it.
+
+    The fix goes to who asked alone: neither to the stream of fixes nor into the figures.
+    """
+    if not request.app.state.settings.simulation:
+        raise ProblemError(
+            FORBIDDEN, "this service does not simulate; start it with --allow-simulation, or listen on loopback"
+        )
+    wanted = parse_simulation(body)
+    return JSONResponse(await asyncio.to_thread(_simulate_and_locate, served.locator, wanted))
+
+
+@router.post(
+    "/posteriors",
+    summary="The whole posterior of a report",
+    response_model=PosteriorDocument,
+    responses=POSITION_PROBLEMS,
+    openapi_extra=request_body(ReportDocument, REPORT_EXAMPLES),
+)
+async def post_posterior(served: TableDep, body: ReportBody) -> JSONResponse:
+    """Give the Gaussians of the posterior and positions drawn from it, for pictures."""
+    return JSONResponse(await asyncio.to_thread(picture_posterior, served.locator, parse_report(body)))
+
+
+def viewer_settings(table: Table, *, simulation: bool) -> ViewerSettings:
+    """Gather what the viewer must know beforehand."""
+    propagation = table.site.document.get("propagation", {})
+    return ViewerSettings(
+        simulation=simulation, max_reflections=int(propagation.get("max_reflections", _MAX_REFLECTIONS))
+    )
+
+
+def picture_posterior(locator: Locator, report: Report) -> dict[str, Any]:
+    """Build what :class:`PosteriorDocument` describes; the same report gives the same samples."""
+    posterior = locator.posterior(report)
+    return posterior_document(posterior, posterior.sample(_SAMPLES, np.random.default_rng(0)))
+
+
+def _simulate_and_locate(locator: Locator, wanted: SimulationRequest) -> dict[str, Any]:
+    paths, measurements = simulate(
+        locator.table,
+        wanted.position,
+        kinds=wanted.kinds,
+        angle_stdev=float(np.deg2rad(wanted.angle_stdev_deg)),
+        range_stdev=wanted.range_stdev_m,
+        rng=np.random.default_rng(wanted.seed),
+    )
+    report = {"target_id": wanted.target_id, "measurements": measurements}
+    begin = perf_counter()
+    fix = locator.locate(parse_report(report))
+    return {
+        "report": report,
+        "fix": fix_to_document(fix, perf_counter() - begin),
+        "paths": [path_document(path) for path in paths],
+    }

@@ -1,0 +1,176 @@
+"""Reports of a UE at a given place, made from the table alone.
+
+At the place, each component of a station's finest level has a density; the one with the highest stands for the path
+that the station reports, and E[u | x] of it for what a perfect one would measure. That is as true as the table is: a
+forward solver knows paths exactly, but the service has none.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_tables.angles import wrap
+from rayfix_tables.errors import ReportError
+from rayfix_tables.mixture import unpack
+from rayfix_tables.table import StationPart, Table
+
+Kind = Literal["aoa", "pt", "toa", "tdoa"]
+
+_NEAREST = 4096
+"""Components whose means are nearest to the place are looked at."""
+
+_REACH = 5.0
+"""A component of which the place is more standard deviations away than this says nothing of it."""
+
+_CLOCK_RANGE = 300.0  # m, one microsecond
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedPath:
+    """The path by which a station hears a place.
+
+    Attributes
+    ----------
+    azimuth, zenith : float, rad
+        From the station towards the incoming ray, in the scene frame.
+    path_length : float, m
+    num_reflections : int
+    """
+
+    station_id: str
+    azimuth: float
+    zenith: float
+    path_length: float
+    num_reflections: int
+
+
+def find_path(part: StationPart, place: NDArray[np.float64]) -> SimulatedPath | None:
+    """Path by which a station most probably hears a place; None where it does not.
+
+    Parameters
+    ----------
+    part : StationPart
+    place : ndarray of shape (3,), m
+    """
+    level = part.levels[0]
+    mixture = level.mixture
+    if not len(mixture):
+        return None
+    apart = ((mixture.x_mean - place.astype(np.float32)) ** 2).sum(axis=1)
+    near = np.arange(len(apart)) if len(apart) <= _NEAREST else np.argpartition(apart, _NEAREST)[:_NEAREST]
+    u_cov = unpack(mixture.u_cov[near]).astype(np.float64)
+    jacobian = mixture.jacobian[near].astype(np.float64)
+    cross = u_cov @ jacobian.transpose(0, 2, 1)
+    x_cov = jacobian @ cross + unpack(mixture.x_cov[near])
+    from_mean = place - mixture.x_mean[near]
+    gain = np.linalg.solve(x_cov, from_mean[:, :, None])[:, :, 0]
+    square = np.einsum("ni,ni->n", from_mean, gain)
+    cell = np.searchsorted(level.cell_offsets, near, side="right") - 1
+    log_density = level.cell_log_mass[cell] + mixture.log_weight[near]
+    log_density = log_density - 0.5 * (square + np.linalg.slogdet(x_cov)[1])
+    log_density[square > _REACH**2] = -np.inf
+    best = int(np.argmax(log_density))
+    if log_density[best] == -np.inf:
+        return None
+    length, horizontal, vertical = mixture.u_mean[near[best]] + cross[best] @ gain[best]
+    azimuth, zenith = level.grid.centres[cell[best]]
+    return SimulatedPath(
+        station_id=part.station.id,
+        azimuth=float(wrap(azimuth + horizontal / np.sin(zenith))),
+        zenith=float(np.clip(zenith + vertical, 0.0, np.pi)),
+        path_length=float(length),
+        num_reflections=int(mixture.num_reflections[near[best]]),
+    )
+
+
+def simulate(
+    table: Table,
+    place: Sequence[float],
+    *,
+    kinds: Sequence[Kind],
+    angle_stdev: float,
+    range_stdev: float,
+    rng: np.random.Generator,
+) -> tuple[list[SimulatedPath], list[dict[str, Any]]]:
+    """Measure one path per station, with noise and the stations' biases.
+
+    Parameters
+    ----------
+    place : sequence of 3 floats, m
+    kinds : sequence of str
+        What is measured of each path.
+    angle_stdev : float, rad
+        Of azimuth and zenith.
+    range_stdev : float, m
+        Of each time of arrival times the speed of light.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    paths : list of SimulatedPath
+        Of the stations that hear the place.
+    measurements : list of dict
+        As ``POST /v1/positions`` takes them.
+
+    Raises
+    ------
+    ReportError
+        When the place is not in the free space or no station hears it.
+    """
+    point = np.asarray(place, dtype=np.float64)
+    x, y, z = point
+    if not table.scene.free_space.contains(point):
+        raise ReportError(
+            f"position ({x:.2f}, {y:.2f}, {z:.2f}) is in a solid or outside; give one in the free space",
+            path=("position",),
+        )
+    paths = [path for part in table.parts.values() if (path := find_path(part, point)) is not None]
+    if not paths:
+        raise ReportError(
+            f"no station hears position ({x:.2f}, {y:.2f}, {z:.2f}); give one that rays reach", path=("position",)
+        )
+    clock = float(rng.uniform(0.0, _CLOCK_RANGE))
+    measurements: list[dict[str, Any]] = []
+    lengths = []
+    for path in paths:
+        # The draws do not depend on the kinds: with equal seeds, reports of different kinds have the same noise.
+        noise = rng.standard_normal(3)
+        bias = table.parts[path.station_id].station.bias
+        lengths.append(path.path_length + bias.range + range_stdev * float(noise[2]))
+        if "aoa" in kinds:
+            azimuth = float(wrap(path.azimuth + bias.azimuth + angle_stdev * noise[0]))
+            zenith = float(np.clip(path.zenith + bias.zenith + angle_stdev * noise[1], 0.0, np.pi))
+            measurements.append(_angle(path.station_id, azimuth, zenith, angle_stdev))
+    for n, (path, length) in enumerate(zip(paths, lengths, strict=True)):
+        common = {"station_id": path.station_id, "stdev_m": range_stdev}
+        if "pt" in kinds:
+            measurements.append({"type": "pt", "range_m": round(length, 4), **common})
+        if "toa" in kinds:
+            measurements.append({"type": "toa", "range_m": round(length + clock, 4), **common})
+        if "tdoa" in kinds and n > 0:
+            measurements.append(
+                {
+                    "type": "tdoa",
+                    "station_id": path.station_id,
+                    "reference_station_id": paths[0].station_id,
+                    "range_difference_m": round(length - lengths[0], 4),
+                    "stdev_m": round(range_stdev * 2.0**0.5, 4),
+                }
+            )
+    return paths, measurements
+
+
+def _angle(station_id: str, azimuth: float, zenith: float, stdev: float) -> dict[str, Any]:
+    deviation = round(float(np.rad2deg(stdev)), 6)
+    return {
+        "type": "aoa",
+        "station_id": station_id,
+        "azimuth_deg": round(float(np.rad2deg(azimuth)), 4),
+        "zenith_deg": round(float(np.rad2deg(zenith)), 4),
+        "azimuth_stdev_deg": deviation,
+        "zenith_stdev_deg": deviation,
+        "frame": "scene",
+    }
