@@ -4,7 +4,8 @@
 >>> table = rayfix.build("site.toml")                # or rayfix.Table.open("site.h5")
 >>> fix = rayfix.Locator(table).locate(report)       # a rayfix.Report or a dict of the HTTP interface's JSON
 
-The offline half needs the extra ``rayfix[offline]``, the fusion ``rayfix[service]``; reading tables needs neither.
+The offline half needs the extra ``rayfix[offline]``, the fusion ``rayfix[service]``, asking a service over the network
+``rayfix[client]``; reading tables needs none.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from rayfix.api import Locator as Locator
     from rayfix.api import Tracker as Tracker
     from rayfix.api import build as build
+    from rayfix.client import AsyncClient as AsyncClient
+    from rayfix.client import Client as Client
     from rayfix_service.fusion.posterior import Posterior as Posterior
     from rayfix_service.fusion.report import Fix as Fix
     from rayfix_service.fusion.report import Report as Report
@@ -28,6 +31,8 @@ if TYPE_CHECKING:
 __version__ = software_version()
 
 __all__ = [
+    "AsyncClient",
+    "Client",
     "Fix",
     "Locator",
     "Posterior",
@@ -48,6 +53,10 @@ def __getattr__(name: str) -> Any:
     """Import what needs an extra when it is first asked for."""
     if name not in __all__:
         raise AttributeError(f"module 'rayfix' has no attribute '{name}'")
+    if name in ("AsyncClient", "Client"):
+        from rayfix import client
+
+        return getattr(client, name)
     from rayfix import api
 
     return getattr(api, name)

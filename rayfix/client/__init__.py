@@ -1,0 +1,44 @@
+"""A client of the service: :class:`Client` and :class:`AsyncClient`, their answers and errors.
+
+It needs the extra ``rayfix[client]`` alone, neither that of the service nor any table.
+"""
+
+from rayfix.client.asynchronous import AsyncClient
+from rayfix.client.errors import (
+    AnswerError,
+    ClientError,
+    ProblemError,
+    RefusedReportError,
+    UnreachableError,
+)
+from rayfix.client.models import (
+    Candidate,
+    FixAnswer,
+    FixEvent,
+    Outcome,
+    Point,
+    StationAnswer,
+    TableAnswer,
+    TrackAnswer,
+)
+from rayfix.client.retries import RetryPolicy
+from rayfix.client.synchronous import Client
+
+__all__ = [
+    "AnswerError",
+    "AsyncClient",
+    "Candidate",
+    "Client",
+    "ClientError",
+    "FixAnswer",
+    "FixEvent",
+    "Outcome",
+    "Point",
+    "ProblemError",
+    "RefusedReportError",
+    "RetryPolicy",
+    "StationAnswer",
+    "TableAnswer",
+    "TrackAnswer",
+    "UnreachableError",
+]

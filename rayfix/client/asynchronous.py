@@ -1,0 +1,219 @@
+"""The client for asyncio."""
+
+import asyncio
+from collections.abc import AsyncIterable, AsyncIterator, Callable, Iterable, Mapping
+from functools import partial
+from random import Random
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from rayfix.client.calls import (
+    Call,
+    Flow,
+    NoReply,
+    Pause,
+    Reply,
+    batch_answers,
+    batch_calls,
+    position_call,
+    reason_of,
+    report_bytes,
+    request,
+    stream_answer,
+)
+from rayfix.client.errors import ProblemError, UnreachableError
+from rayfix.client.feed import SILENCE_SECONDS, Feed
+from rayfix.client.models import (
+    FixAnswer,
+    FixEvent,
+    StationAnswer,
+    TableAnswer,
+    fix_answer,
+    station_answers,
+    table_answer,
+)
+from rayfix.client.retries import NO_RETRIES, RetryPolicy
+from rayfix.client.settings import ClientSettings
+from rayfix.extras import needs_extra
+
+with needs_extra("client"):
+    import httpx
+
+T = TypeVar("T")
+
+
+class AsyncClient:
+    """Asks a service for positions, for asyncio; the methods are those of :class:`~rayfix.client.Client`.
+
+    Parameters
+    ----------
+    url : str
+        Address of the service, such as ``http://localhost:8000``.
+    api_key, table, track, timeout, retries
+        As in :class:`~rayfix.client.settings.ClientSettings`.
+    transport : httpx.AsyncBaseTransport, optional
+        What carries the requests, for tests and special networks.
+
+    Raises
+    ------
+    ClientError
+        When ``url`` is no address. All methods raise kin of it; docs/client.md lists them.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        api_key: str | None = None,
+        table: str | None = None,
+        track: bool | None = None,
+        timeout: float = 30.0,
+        retries: RetryPolicy | None = None,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self.settings = ClientSettings(
+            url=url, api_key=api_key, table=table, track=track, timeout=timeout, retries=retries or RetryPolicy()
+        )
+        self._random = Random()
+        self._http = httpx.AsyncClient(headers=self.settings.headers, timeout=timeout, transport=transport)
+
+    async def __aenter__(self) -> Self:
+        """Return the client."""
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the client."""
+        await self.close()
+
+    async def close(self) -> None:
+        """Close its connections."""
+        await self._http.aclose()
+
+    async def locate(self, report: Mapping[str, Any] | object) -> FixAnswer:
+        """Locate one report.
+
+        Parameters
+        ----------
+        report : Mapping or rayfix.Report
+            A mapping has the form of the JSON that ``POST /v1/positions`` takes.
+        """
+        return await self._ask(position_call(report, self.settings.position_query), fix_answer)
+
+    async def locate_as(self, report: Mapping[str, Any] | object, output: str) -> dict[str, Any]:
+        """Locate one report; returns the answer's JSON in a format of docs/formats.md, such as ``"omlox"``."""
+        return await self._ask(position_call(report, self.settings.position_query | {"output": output}), dict)
+
+    async def locate_batch(self, reports: Iterable[Mapping[str, Any] | object]) -> list[FixAnswer | ProblemError]:
+        """Locate any number of reports, in as many requests as that takes.
+
+        Returns
+        -------
+        list of (FixAnswer or ProblemError)
+            In the order of the reports; the error, not raised, of a report that cannot be used.
+        """
+        answers: list[FixAnswer | ProblemError] = []
+        for count, call in batch_calls(reports, self.settings.position_query):
+            answers += await self._ask(call, partial(batch_answers, count=count))
+        return answers
+
+    async def stations(self) -> tuple[StationAnswer, ...]:
+        """List the stations that reports may name."""
+        return await self._ask(
+            Call(method="GET", path="/v1/stations", query=self.settings.table_query), station_answers
+        )
+
+    async def table(self) -> TableAnswer:
+        """Tell which table answers."""
+        return await self._ask(Call(method="GET", path="/v1/table", query=self.settings.table_query), table_answer)
+
+    async def ready(self) -> bool:
+        """Whether the service can locate now; asks once."""
+        try:
+            await self._drive(request(Call(method="GET", path="/readyz"), dict, NO_RETRIES, self._random))
+        except (ProblemError, UnreachableError):
+            return False
+        return True
+
+    async def fixes(self, target_id: str | None = None) -> AsyncIterator[FixEvent]:
+        """Listen to the fixes that the service makes of anyone's reports, until the iteration is ended.
+
+        A connection that is lost is made again; fixes in between are lost.
+
+        Parameters
+        ----------
+        target_id : str, optional
+            The only target to hear of.
+        """
+        query = self.settings.feed_query(target_id)
+        feed = Feed(self.settings.retries, self._random)
+        while True:
+            try:
+                async with self._http.stream(
+                    "GET", self.settings.base + "/v1/fixes", params=query, timeout=SILENCE_SECONDS
+                ) as answer:
+                    if answer.status_code == 200:
+                        feed.opened()
+                        async for line in answer.aiter_lines():
+                            event = feed.take(line)
+                            if event is not None:
+                                yield event
+                        pause = feed.lost("the service ended it")
+                    else:
+                        pause = feed.refused(
+                            answer.status_code, await answer.aread(), answer.headers.get("retry-after")
+                        )
+            except httpx.TransportError as error:
+                pause = feed.lost(reason_of(error))
+            await asyncio.sleep(pause)
+
+    async def stream(
+        self, reports: AsyncIterable[Mapping[str, Any] | object]
+    ) -> AsyncIterator[FixAnswer | ProblemError]:
+        """Send reports over one web socket, each when the last is answered; yields the answers.
+
+        For one sender of many reports this is faster than requests. A lost connection is not made again.
+        """
+        with needs_extra("client"):
+            from websockets.asyncio.client import connect
+            from websockets.exceptions import WebSocketException
+        try:
+            async with connect(self.settings.stream_url, additional_headers=self.settings.headers) as socket:
+                async for report in reports:
+                    await socket.send(report_bytes(report), text=True)
+                    async with asyncio.timeout(self.settings.timeout):
+                        answer = stream_answer(await socket.recv())
+                    yield answer
+        except (OSError, WebSocketException) as error:
+            raise UnreachableError(f"the stream is lost ({reason_of(error)}); is the service still there?") from None
+
+    async def _ask(self, call: Call, parse: Callable[[Any], T]) -> T:
+        return await self._drive(request(call, parse, self.settings.retries, self._random))
+
+    async def _drive(self, flow: Flow[T]) -> T:
+        reply: Reply | NoReply | None = None
+        while True:
+            try:
+                wanted = flow.send(reply)
+            except StopIteration as stop:
+                result: T = stop.value
+                return result
+            reply = None
+            if isinstance(wanted, Pause):
+                await asyncio.sleep(wanted.seconds)
+            else:
+                reply = await self._send(wanted)
+
+    async def _send(self, call: Call) -> Reply | NoReply:
+        try:
+            answer = await self._http.request(
+                call.method,
+                self.settings.base + call.path,
+                params=dict(call.query),
+                headers=dict(call.headers),
+                content=call.body,
+            )
+        except httpx.TransportError as error:
+            return NoReply(reason=reason_of(error))
+        return Reply(status=answer.status_code, headers=dict(answer.headers), body=answer.content)

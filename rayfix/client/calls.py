@@ -1,0 +1,194 @@
+"""What is sent and what becomes of the answers, without any input or output: both clients drive the same flows.
+
+A flow is a generator. It yields a :class:`Call`, for which it is sent a :class:`Reply` or a :class:`NoReply`, or a
+:class:`Pause`, and returns what the caller wants.
+"""
+
+import json
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from random import Random
+from typing import Any, TypeVar
+
+from rayfix.client.errors import AnswerError, ProblemError, ProblemField, RefusedReportError, UnreachableError
+from rayfix.client.models import FixAnswer, fix_answer
+from rayfix.client.retries import RetryPolicy, is_temporary
+
+T = TypeVar("T")
+
+BATCH_REPORTS = 1000
+"""Reports that the service takes in one batch."""
+
+BATCH_BYTES = 8 << 20
+"""Bytes of one batch; the service takes twice as much."""
+
+_REPORT_PROBLEMS = frozenset({"urn:rayfix:problem:invalid-report", "urn:rayfix:problem:malformed-json"})
+_JSON = {"content-type": "application/json"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Call:
+    """One request."""
+
+    method: str
+    path: str
+    query: Mapping[str, str] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+    body: bytes | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reply:
+    """An answer; names of headers are lower case."""
+
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoReply:
+    """There was no answer; ``reason`` says why."""
+
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pause:
+    """Time to wait, s."""
+
+    seconds: float
+
+
+Flow = Generator[Call | Pause, Reply | NoReply | None, T]
+
+
+def request(call: Call, parse: Callable[[Any], T], policy: RetryPolicy, random: Random) -> Flow[T]:
+    """Send a request, again where that may help, and read its answer.
+
+    Raises
+    ------
+    ClientError
+    """
+    attempt = 0
+    while True:
+        attempt += 1
+        reply = yield call
+        assert reply is not None
+        if isinstance(reply, Reply) and not is_temporary(reply.status):
+            return read(reply, parse)
+        wanted = reply.headers.get("retry-after") if isinstance(reply, Reply) else None
+        pause = policy.pause(attempt, random, wanted)
+        if pause is None:
+            if isinstance(reply, NoReply):
+                tries = "" if attempt == 1 else f" after {attempt} attempts"
+                raise UnreachableError(f"the service does not answer{tries} ({reply.reason}); is its address right?")
+            return read(reply, parse)
+        yield Pause(seconds=pause)
+
+
+def read(reply: Reply, parse: Callable[[Any], T]) -> T:
+    """Read an answer.
+
+    Raises
+    ------
+    ProblemError
+        For a problem document.
+    AnswerError
+        For anything that the service does not answer.
+    """
+    try:
+        document = json.loads(reply.body)
+    except ValueError:
+        document = None
+    if 200 <= reply.status < 300:
+        try:
+            return parse(document)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            text = "is none of this service's, or of another version; is the address right?"
+            raise AnswerError(f"the answer (status {reply.status}) {text}") from None
+    raise problem(document, reply.status)
+
+
+def problem(document: Any, status: int) -> ProblemError | AnswerError:
+    """Turn a problem document into the error that it means."""
+    try:
+        errors = tuple(ProblemField(path=one["path"], message=one["message"]) for one in document["errors"])
+        kind, detail = document["type"], document["detail"]
+    except (KeyError, TypeError):
+        return AnswerError(f"the answer has the status {status} and no problem document; is the address right?")
+    error = RefusedReportError if kind in _REPORT_PROBLEMS else ProblemError
+    return error(detail, kind=kind, status=status, errors=errors)
+
+
+def stream_answer(message: str | bytes) -> FixAnswer | ProblemError:
+    """Read the answer to a report on a stream.
+
+    Raises
+    ------
+    AnswerError
+        For what is neither a fix nor a problem.
+    """
+    try:
+        return batch_answers({"results": [json.loads(message)]}, 1)[0]
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise AnswerError("the stream answers with what is no fix; is the address right?") from None
+
+
+def reason_of(error: Exception) -> str:
+    """Say why there is no answer, in a few words."""
+    return str(error) or type(error).__name__
+
+
+def report_bytes(report: Any) -> bytes:
+    """Write a report: a mapping of the JSON that ``POST /v1/positions`` takes, or a ``rayfix.Report``."""
+    if not isinstance(report, Mapping):
+        from rayfix_service.wire import report_to_document  # who has such a report has its package
+
+        report = report_to_document(report)
+    return json.dumps(report, separators=(",", ":")).encode()
+
+
+def position_call(report: Any, query: Mapping[str, str]) -> Call:
+    """Call for the position of one report; its target is in a header, for proxies that choose a worker by it."""
+    target = report.get("target_id") if isinstance(report, Mapping) else getattr(report, "target_id", None)
+    headers = dict(_JSON)
+    if isinstance(target, str) and target.isascii() and target.isprintable():
+        headers["x-target-id"] = target.strip()
+    return Call(method="POST", path="/v1/positions", query=query, headers=headers, body=report_bytes(report))
+
+
+def batch_calls(reports: Iterable[Any], query: Mapping[str, str]) -> Iterator[tuple[int, Call]]:
+    """Cut reports into batches that the service takes; each with the number of its reports."""
+    batch: list[bytes] = []
+    size = 0
+    for report in reports:
+        text = report_bytes(report)
+        if batch and (len(batch) == BATCH_REPORTS or size + len(text) > BATCH_BYTES):
+            yield len(batch), _batch_call(batch, query)
+            batch, size = [], 0
+        batch.append(text)
+        size += len(text) + 1
+    if batch:
+        yield len(batch), _batch_call(batch, query)
+
+
+def batch_answers(document: Any, count: int) -> tuple[FixAnswer | ProblemError, ...]:
+    """Read the answers to a batch; ValueError for what are not so many fixes and problems."""
+    answers: list[FixAnswer | ProblemError] = []
+    for one in document["results"]:
+        if "errors" in one:
+            error = problem(one, one["status"] if isinstance(one["status"], int) else 0)
+            if isinstance(error, AnswerError):
+                raise ValueError(str(error))
+            answers.append(error)
+        else:
+            answers.append(fix_answer(one))
+    if len(answers) != count:
+        raise ValueError(f"{len(answers)} answers to {count} reports")
+    return tuple(answers)
+
+
+def _batch_call(batch: list[bytes], query: Mapping[str, str]) -> Call:
+    body = b'{"reports":[' + b",".join(batch) + b"]}"
+    return Call(method="POST", path="/v1/positions/batch", query=query, headers=_JSON, body=body)

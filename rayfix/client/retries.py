@@ -1,0 +1,74 @@
+"""When a request is sent again, and after which pause."""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from random import Random
+
+_AGAIN = frozenset({429, 502, 503, 504})
+"""Statuses of a service that is busy, starting, or behind a proxy that cannot reach it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetryPolicy:
+    """How often and how patiently requests are repeated.
+
+    A report may be sent twice: the service remembers nothing of it, and where it follows targets a report of the same
+    time is not counted again.
+
+    Attributes
+    ----------
+    attempts : int
+        Times that a request is sent at most; 1 for never again.
+    first_pause, longest_pause : float, s
+        The pause before attempt n + 1 is drawn from 0 to ``first_pause`` times 2 to the power n - 1, and at most the
+        longest: clients that lost the service together do not come back together ("full jitter": M. Brooker,
+        "Exponential backoff and jitter", 2015).
+    longest_retry_after : float, s
+        A service that asks for more patience than this is not waited for.
+    """
+
+    attempts: int = 5
+    first_pause: float = 0.2
+    longest_pause: float = 10.0
+    longest_retry_after: float = 60.0
+
+    def pause(self, attempt: int, random: Random, retry_after: str | None = None) -> float | None:
+        """Pause after the attempt of that number, from 1 on; None where there is to be no other, s.
+
+        Parameters
+        ----------
+        attempt : int
+        random : random.Random
+        retry_after : str, optional
+            The header of that name: the pause is at least as long.
+        """
+        if attempt >= self.attempts:
+            return None
+        least = seconds_of(retry_after) if retry_after is not None else 0.0
+        if least > self.longest_retry_after:
+            return None
+        drawn = random.uniform(0.0, min(self.longest_pause, self.first_pause * 2.0 ** (attempt - 1)))
+        return least + drawn
+
+
+NO_RETRIES = RetryPolicy(attempts=1)
+
+
+def is_temporary(status: int) -> bool:
+    """Whether a status says that the same request may succeed later."""
+    return status in _AGAIN
+
+
+def seconds_of(retry_after: str) -> float:
+    """Read a Retry-After header, seconds or a date (RFC 9110, 10.2.3); 0 for anything else."""
+    text = retry_after.strip()
+    if text.isdecimal():
+        return float(text)
+    try:
+        moment = parsedate_to_datetime(text)
+    except ValueError:
+        return 0.0
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    return max(0.0, (moment - datetime.now(UTC)).total_seconds())
