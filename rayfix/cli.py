@@ -90,6 +90,24 @@ def _parser() -> argparse.ArgumentParser:
     _add_output_arguments(locate)
     locate.add_argument("--json", action="store_true", help="the answer of the HTTP interface")
 
+    plan = add("plan", _plan, "forecast errors and coverage over the floor of a table and draw the map")
+    plan.add_argument("table", type=Path, metavar="T.h5")
+    plan.add_argument("-o", "--output", type=Path, required=True, metavar="MAP.png", help="picture: .png, .svg or .pdf")
+    plan.add_argument("--height", type=float, required=True, metavar="Z", help="of the targets in the scene, m")
+    plan.add_argument("--azimuth-stdev-deg", type=float, default=1.0, metavar="DEG", help="(default: 1)")
+    plan.add_argument("--zenith-stdev-deg", type=float, metavar="DEG", help="(default: that of the azimuth)")
+    plan.add_argument("--times", choices=("none", "pt", "toa", "tdoa"), default="none", help="(default: none)")
+    plan.add_argument(
+        "--range-stdev-m", type=float, default=0.5, metavar="M", help="of times, as length (default: 0.5)"
+    )
+    plan.add_argument("--beside", type=Path, metavar="OTHER.h5", help="table of the site with a station added or moved")
+    plan.add_argument("--spacing-m", type=float, default=0.5, metavar="M", help="side of the squares (default: 0.5)")
+    plan.add_argument("--threshold-m", type=float, default=1.0, metavar="M", help="largest useful error (default: 1)")
+    plan.add_argument("--draws", type=int, default=4, help="reports from each square (default: 4)")
+    plan.add_argument("--seed", type=int, default=1, help="of places and noise (default: 1)")
+    plan.add_argument("--no-progress", action="store_true", help="show no progress bar")
+    plan.add_argument("--json", action="store_true", help="print the map as JSON, one line for each table")
+
     serve = add("serve", _serve, "serve a table, or all tables of a folder, over HTTP")
     serve.add_argument("tables", type=Path, metavar="T.h5|DIR")
     serve.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
@@ -261,6 +279,27 @@ def _locate(options: argparse.Namespace) -> int:
             if len(answers) > 1:
                 print(f"{document['target_id']}:")
             print_fix(document)
+    return 0
+
+
+def _plan(options: argparse.Namespace) -> int:
+    with needs_extra("all"):
+        from rayfix.plan import plan_document, plan_lines, plan_settings, plan_tables
+    settings = plan_settings(
+        height=options.height,
+        azimuth_stdev_deg=options.azimuth_stdev_deg,
+        zenith_stdev_deg=options.zenith_stdev_deg,
+        timing=options.times,
+        range_stdev=options.range_stdev_m,
+        spacing=options.spacing_m,
+        threshold=options.threshold_m,
+        draws=options.draws,
+        seed=options.seed,
+    )
+    tables = [options.table, *([options.beside] if options.beside else [])]
+    maps = plan_tables(tables, settings, options.output, progress=not options.no_progress)
+    for line in [json.dumps(plan_document(*each)) for each in maps] if options.json else plan_lines(maps):
+        print(line)
     return 0
 
 
