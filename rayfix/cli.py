@@ -120,6 +120,23 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="let the viewer simulate reports (on a loopback address it always may)",
     )
+    serve.add_argument(
+        "--api-keys", type=Path, metavar="FILE", help="keys to ask for; needed unless only this machine can reach HOST"
+    )
+    serve.add_argument(
+        "--rate-limit", type=_rate, metavar="N", help="reports that each key may send a second (default: no limit)"
+    )
+    serve.add_argument(
+        "--cors-origin",
+        action="append",
+        default=[],
+        metavar="ORIGIN",
+        help="let pages of this origin, e.g. https://maps.example.com, call from browsers; may be given several times",
+    )
+
+    api_key = add("api-key", _api_key, "make an API key, print it once, and add its hash to a key file")
+    api_key.add_argument("name", metavar="NAME", help="whose it is")
+    api_key.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="key file, made if need be")
 
     mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: angles of Silicon Labs locators in, positions out")
     mqtt.add_argument("table", type=Path, metavar="T.h5")
@@ -173,6 +190,13 @@ def _jobs(text: str) -> int:
     if jobs == 0 or jobs < -1:
         raise argparse.ArgumentTypeError(f"{jobs} is not a number of jobs; give 1 or more, or -1 for one per core")
     return jobs
+
+
+def _rate(text: str) -> float:
+    rate = float(text)
+    if not 0.0 < rate < 1e9:
+        raise argparse.ArgumentTypeError(f"{text} is no rate; give a number of reports a second, e.g. 100")
+    return rate
 
 
 def _tolerance(text: str) -> float:
@@ -314,8 +338,20 @@ def _serve(options: argparse.Namespace) -> int:
         workers=options.workers,
         log_format=options.log_format,
         access_log=options.access_log,
-        settings=ServiceSettings(simulation=options.allow_simulation or is_loopback(options.host)),
+        settings=ServiceSettings(
+            api_keys=options.api_keys,
+            reports_per_second=options.rate_limit,
+            cors_origins=tuple(options.cors_origin),
+            simulation=options.allow_simulation or is_loopback(options.host),
+        ),
     )
+    return 0
+
+
+def _api_key(options: argparse.Namespace) -> int:
+    with needs_extra("service"):
+        from rayfix_service.http.keys import add_key
+    print(add_key(options.output, options.name))
     return 0
 
 

@@ -15,8 +15,12 @@ import pytest
 
 _CODE = """\
 import json, sys
+from pydantic import TypeAdapter
 from rayfix_service.http.server import serve
-serve(sys.argv[1], **json.loads(sys.argv[2]))
+from rayfix_service.http.settings import ServiceSettings
+options = json.loads(sys.argv[2])
+settings = TypeAdapter(ServiceSettings).validate_python(options.pop("settings", {}))
+serve(sys.argv[1], settings=settings, **options)
 """
 
 

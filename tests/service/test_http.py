@@ -620,27 +620,27 @@ def test_every_error_of_the_openapi_document_is_a_problem(openapi: dict[str, Any
                     schema = response["content"]["application/problem+json"]["schema"]
                     assert schema == {"$ref": "#/components/schemas/Problem"}
                     assert list(response["content"]) == ["application/problem+json"]
-    position = {"200", "400", "404", "413", "415", "422", "503"}
+    position = {"200", "400", "401", "404", "413", "415", "422", "429", "503", "504"}
     assert statuses == {
         "/v1/positions": position,
         "/v1/positions/batch": position,
         "/v1/positions/nrppa": position,
         "/v1/positions/silabs": position,
         "/v1/positions/ublox": position - {"400"},
-        "/v1/fixes": {"200", "404", "422", "503"},
-        "/v1/table": {"200", "404", "422", "503"},
-        "/v1/tables": {"200", "503"},
-        "/v1/tables/reload": {"200", "409"},
-        "/v1/stations": {"200", "404", "422", "503"},
-        "/v1/viewer": {"200", "404", "422", "503"},
-        "/v1/scene.glb": {"200", "404", "422", "503"},
-        "/v1/stations/{station_id}/mixture": {"200", "404", "422", "503"},
-        "/v1/stations/{station_id}/coverage": {"200", "404", "422", "503"},
+        "/v1/fixes": {"200", "401", "404", "422", "503"},
+        "/v1/table": {"200", "401", "404", "422", "503"},
+        "/v1/tables": {"200", "401", "503"},
+        "/v1/tables/reload": {"200", "401", "409", "429"},
+        "/v1/stations": {"200", "401", "404", "422", "503"},
+        "/v1/viewer": {"200", "401", "404", "422", "503"},
+        "/v1/scene.glb": {"200", "401", "404", "422", "503"},
+        "/v1/stations/{station_id}/mixture": {"200", "401", "404", "422", "503"},
+        "/v1/stations/{station_id}/coverage": {"200", "401", "404", "422", "503"},
         "/v1/simulations": position | {"403"},
         "/v1/posteriors": position,
         "/livez": {"200"},
         "/readyz": {"200", "503"},
-        "/metrics": {"200"},
+        "/metrics": {"200", "401"},
     }
 
 

@@ -1,6 +1,8 @@
 """The HTTP service as a process of its own, and what it checks before it starts."""
 
+import errno
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -11,14 +13,17 @@ from typing import Any
 
 import pytest
 
+from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.examples import REPORT_EXAMPLES
+from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE
 from rayfix_service.http.server import (
     SERVICE_VARIABLE,
-    ServiceError,
     app_from_environment,
     check_address,
+    is_loopback,
     serve,
 )
+from rayfix_service.http.settings import ServiceSettings
 from rayfix_tables.errors import NotATableError, TableError
 
 REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]
@@ -85,6 +90,19 @@ def test_the_log_may_be_json(hall_table_path: Path, start_server: StartServer):
     assert 0 < access["seconds"] < 30
 
 
+def no_room(*arguments: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_what_only_this_machine_reaches():
+    assert is_loopback("127.0.0.1")
+    assert is_loopback("::1")
+    assert is_loopback("localhost")
+    assert not is_loopback("0.0.0.0")
+    assert not is_loopback("192.0.2.1")
+    assert not is_loopback("no.such.host.invalid")
+
+
 def test_what_cannot_be_served_is_said_first(hall_table_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(TableError, match="nowhere"):
         serve(tmp_path / "nowhere.h5")
@@ -98,6 +116,22 @@ def test_what_cannot_be_served_is_said_first(hall_table_path: Path, tmp_path: Pa
         check_address("no.such.host.invalid", 8000)
     with pytest.raises(ServiceError, match=r"192\.0\.2\.1"):  # an address kept for documentation
         check_address("192.0.2.1", 8000)
+    for host in ("0.0.0.0", "::"):
+        with pytest.raises(ServiceError, match="API keys are needed; make one with 'rayfix api-key"):
+            serve(hall_table_path, host=host)
+    for keys, text in [("missing", "cannot be read"), ("empty", "has no key"), ("wrong", "line 2 is no NAME:HASH")]:
+        (tmp_path / "empty").write_text("# none yet\n")
+        (tmp_path / "wrong").write_text("\nsecret\n")
+        with pytest.raises(ServiceError, match=text):
+            serve(hall_table_path, settings=ServiceSettings(api_keys=tmp_path / keys))
+    monkeypatch.setenv(MULTIPROCESS_VARIABLE, str(tmp_path / "nowhere"))
+    with pytest.raises(ServiceError, match="nowhere, where figures cannot be written"):
+        serve(hall_table_path, port=0)
+    monkeypatch.setenv(MULTIPROCESS_VARIABLE, str(tmp_path))
+    monkeypatch.setattr("os.posix_fallocate", no_room)
+    with pytest.raises(ServiceError, match=r"No space left on device.*make room"):
+        serve(hall_table_path, port=0)
+    assert {path.name for path in tmp_path.iterdir()} == {"empty", "wrong"}
     monkeypatch.delenv(SERVICE_VARIABLE, raising=False)
     with pytest.raises(ServiceError, match=SERVICE_VARIABLE):
         app_from_environment()

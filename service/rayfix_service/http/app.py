@@ -1,29 +1,38 @@
 """The web application."""
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
+from fastapi.middleware.cors import CORSMiddleware
 from pydantic.json_schema import models_json_schema
 
 from rayfix_service.adapters.nrppa_documents import NrppaDocument
 from rayfix_service.adapters.silabs import SilabsDocument
 from rayfix_service.http import routes_formats, routes_health, routes_positions, routes_stream, routes_table
+from rayfix_service.http.access import Access, describe_access
+from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.feed import FixFeed
+from rayfix_service.http.keys import ApiKeys
 from rayfix_service.http.metrics import Metrics, forget_dead_workers
 from rayfix_service.http.problems import Problem, install_problems
-from rayfix_service.http.request_context import RequestContext
+from rayfix_service.http.rates import RateLimit
+from rayfix_service.http.request_context import HEADER, RequestContext
 from rayfix_service.http.routes_stream import FixEventDocument
 from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.http.slow_fixes import SlowFixes
 from rayfix_service.http.stopping import on_stop_signal
 from rayfix_service.http.tables import Tables
 from rayfix_service.web import routes_assets, routes_scene, routes_simulation
 from rayfix_service.web.documents import SimulationRequest
 from rayfix_service.web.per_table import PerTable
 from rayfix_service.wire import BatchDocument, ReportDocument
+
+_log = logging.getLogger(__name__)
 
 _DESCRIPTION = """\
 Indoor positions from angles and times of arrival, fused with a digital twin of the building.
@@ -53,7 +62,8 @@ class RayfixApp(FastAPI):
                 ],
                 ref_template="#/components/schemas/{model}",
             )
-            document.setdefault("components", {}).setdefault("schemas", {}).update(schemas["$defs"])
+            document["components"]["schemas"].update(schemas["$defs"])
+            describe_access(document)
             self.openapi_schema = document
         return self.openapi_schema
 
@@ -69,6 +79,11 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
     tables_path : pathlib.Path
         The table, or a folder of tables. One that does not pass its check leaves the application not ready.
     settings : ServiceSettings, optional
+
+    Raises
+    ------
+    ServiceError
+        When the key file cannot be used.
     """
     settings = settings or ServiceSettings()
 
@@ -76,7 +91,12 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         state = app.state
         state.tables = tables = Tables(tables_path, state.metrics, runtime_folder=settings.runtime_folder)
-        keeping = asyncio.create_task(tables.keep(settings.watch_seconds))
+        keeping = [asyncio.create_task(tables.keep(settings.watch_seconds))]
+        if keys is not None:
+            keeping.append(asyncio.create_task(_keep_keys(keys, settings.watch_seconds)))
+        state.slow_fixes = SlowFixes(
+            threads=settings.slow_fix_threads, waiting=settings.slow_fixes_waiting, seconds=settings.fix_seconds
+        )
         stopping = asyncio.Event()
 
         def stop() -> None:
@@ -91,8 +111,10 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
                 yield
         finally:
             stop()
-            keeping.cancel()
-            await asyncio.wait([keeping])
+            for task in keeping:
+                task.cancel()
+            await asyncio.wait(keeping)
+            state.slow_fixes.close()
 
     app = RayfixApp(
         title="rayfix",
@@ -106,6 +128,18 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
     app.state.per_table = PerTable()
     app.state.metrics = Metrics()
     app.state.feed = FixFeed()
+    keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
+    app.state.rate_limit = limit = _rate_limit(settings)
+    app.add_middleware(Access, keys=keys, limit=limit)
+    if settings.cors_origins:
+        # Around the access control, since a browser asks without a key whether it may send one.
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=["Authorization", "Content-Type", "X-API-Key", HEADER],
+            expose_headers=["Retry-After", HEADER],
+        )
     install_problems(app)
     app.add_middleware(RequestContext, metrics=app.state.metrics)  # around all, to see the last resort's answers too
     app.include_router(routes_positions.router)
@@ -117,6 +151,25 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
     app.include_router(routes_simulation.router)
     app.include_router(routes_assets.router)
     return app
+
+
+def _rate_limit(settings: ServiceSettings) -> RateLimit | None:
+    rate = settings.reports_per_second
+    return None if rate is None else RateLimit(rate, max(1.0, rate * settings.burst_seconds))
+
+
+async def _keep_keys(keys: ApiKeys, seconds: float) -> None:
+    """Read the keys again from time to time; while their file cannot be used, those that were go on."""
+    failure = ""
+    while True:
+        await asyncio.sleep(seconds)
+        try:
+            await asyncio.to_thread(keys.reread)
+        except ServiceError as error:
+            if failure != (failure := str(error)):
+                _log.error("keys not read again: %s", error)
+        else:
+            failure = ""
 
 
 async def _take_turn(tables: Tables, marker: Path, stopping: asyncio.Event) -> None:

@@ -1,6 +1,5 @@
 """Locating within a request."""
 
-import asyncio
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,18 +17,13 @@ from rayfix_service.fusion.report import Fix, Report
 from rayfix_service.http.dependencies import TableDep
 from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.metrics import Metrics
-from rayfix_service.http.problems import internal_problem, report_problem
+from rayfix_service.http.problems import ProblemError, internal_problem, problem_document, report_problem
+from rayfix_service.http.slow_fixes import SlowFixes, is_slow
 from rayfix_service.http.tables import ServedTable
 from rayfix_service.wire import fix_to_document, parse_report, report_to_document
 from rayfix_tables.errors import ReportError
 
 _log = logging.getLogger(__name__)
-
-# Routes are "async def" and compute right on the event loop. A fix with an angle takes a millisecond or a few, and
-# in the thread pool that FastAPI has for "def" they would wait for each other's GIL: measured with two threads,
-# 1.6 ms become 3.4. More worker processes use more processor cores. Only a report of very many measurements, which
-# can take seconds, goes to a thread, so that /livez answers meanwhile.
-_MEASUREMENTS_ON_LOOP = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,11 +68,12 @@ def foreign(adapted: Adapted) -> Incoming:
 
 @dataclass(frozen=True, kw_only=True)
 class Answerer:
-    """What answers reports: a table, the figures that it adds to, and the feed that it tells."""
+    """What answers reports: a table, the figures that it adds to, the feed that it tells, the threads for slow ones."""
 
     table: ServedTable
     metrics: Metrics
     feed: FixFeed
+    slow_fixes: SlowFixes
 
     async def answer(self, incoming: Incoming, output: OutputFormat) -> dict[str, Any]:
         """Locate a report and write the answer in a format.
@@ -87,6 +82,8 @@ class Answerer:
         ------
         ReportError
             When a station is not in the table, or the format needs a position and there is none.
+        ProblemError
+            When the fix is slow and the service too busy.
         """
         try:
             fix, seconds = await self._locate(incoming.report)
@@ -103,18 +100,22 @@ class Answerer:
             return await self.answer(make(), output)
         except ReportError as error:
             return report_problem(error)
+        except ProblemError as error:
+            return problem_document(error.kind, str(error))
         except Exception:
             # A defect that one report meets must not cost the other 999 their fix.
             _log.exception("a report of several failed")
             return internal_problem()
 
     async def _locate(self, report: Report) -> tuple[Fix, float]:
-        """Locate a report; returns the fix and the time that it took, s."""
+        """Locate a report; returns the fix and the time that it took, s.
+
+        A fix with an angle takes less than a millisecond or a few, right on the event loop. In the thread pool that
+        FastAPI has for "def" such fixes would wait for each other's GIL; more worker processes use more cores.
+        """
         start = perf_counter()
-        if len(report.measurements) <= _MEASUREMENTS_ON_LOOP:
-            fix = self.table.locator.locate(report)
-        else:
-            fix = await asyncio.to_thread(self.table.locator.locate, report)
+        locate = self.table.locator.locate
+        fix = await self.slow_fixes.locate(locate, report) if is_slow(report) else locate(report)
         seconds = perf_counter() - start
         self.metrics.fix_done(fix, seconds)
         return fix, seconds
@@ -132,7 +133,7 @@ class Answerer:
 async def get_answerer(connection: HTTPConnection, table: TableDep) -> Answerer:
     """Return what answers, or end the request."""
     state = connection.app.state
-    return Answerer(table=table, metrics=state.metrics, feed=state.feed)
+    return Answerer(table=table, metrics=state.metrics, feed=state.feed, slow_fixes=state.slow_fixes)
 
 
 AnswererDep = Annotated[Answerer, Depends(get_answerer)]

@@ -16,6 +16,7 @@ from rayfix_service.http.examples import (
 )
 from rayfix_service.http.problems import (
     BODY_TOO_LARGE,
+    FIX_TIMEOUT,
     INVALID_REPORT,
     MALFORMED_JSON,
     MEDIA_TYPE,
@@ -129,7 +130,7 @@ ADAPTED_ANSWER = _examples(ADAPTED_FIX_EXAMPLE)
 """The answer to a message of another format, for the OpenAPI document."""
 
 POSITION_PROBLEMS = problem_responses(
-    MALFORMED_JSON, NOT_FOUND, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE, INVALID_REPORT, NOT_READY
+    MALFORMED_JSON, NOT_FOUND, BODY_TOO_LARGE, UNSUPPORTED_MEDIA_TYPE, INVALID_REPORT, NOT_READY, FIX_TIMEOUT
 )
 """What may go wrong with a report, for the OpenAPI document."""
 

@@ -36,6 +36,7 @@ class ProblemKind:
 
 MALFORMED_JSON = ProblemKind(status=400, title="Malformed JSON", name="malformed-json")
 CONNECTION_ENDED = ProblemKind(status=400, title="Connection ended", name="connection-ended")
+UNAUTHORIZED = ProblemKind(status=401, title="Unauthorized", name="unauthorized")
 FORBIDDEN = ProblemKind(status=403, title="Forbidden", name="forbidden")
 NOT_FOUND = ProblemKind(status=404, title="Not found", name="not-found")
 METHOD_NOT_ALLOWED = ProblemKind(status=405, title="Method not allowed", name="method-not-allowed")
@@ -44,11 +45,15 @@ BODY_TOO_LARGE = ProblemKind(status=413, title="Body too large", name="body-too-
 UNSUPPORTED_MEDIA_TYPE = ProblemKind(status=415, title="Unsupported media type", name="unsupported-media-type")
 INVALID_REPORT = ProblemKind(status=422, title="Report cannot be used", name="invalid-report")
 INVALID_PARAMETER = ProblemKind(status=422, title="Parameter cannot be used", name="invalid-parameter")
+TOO_MANY_REQUESTS = ProblemKind(status=429, title="Too many requests", name="too-many-requests")
 INTERNAL_ERROR = ProblemKind(status=500, title="Internal error", name="internal-error")
 NOT_READY = ProblemKind(status=503, title="Not ready", name="not-ready")
+OVERLOADED = ProblemKind(status=503, title="Overloaded", name="overloaded")
+FIX_TIMEOUT = ProblemKind(status=504, title="Fix takes too long", name="fix-timeout")
 
 KINDS = (
     MALFORMED_JSON,
+    UNAUTHORIZED,
     FORBIDDEN,
     NOT_FOUND,
     METHOD_NOT_ALLOWED,
@@ -57,8 +62,11 @@ KINDS = (
     UNSUPPORTED_MEDIA_TYPE,
     INVALID_REPORT,
     INVALID_PARAMETER,
+    TOO_MANY_REQUESTS,
     INTERNAL_ERROR,
     NOT_READY,
+    OVERLOADED,
+    FIX_TIMEOUT,
 )
 """Every kind that a client may see; with its connection ended, there is none that sees."""
 

@@ -13,6 +13,7 @@ from rayfix_service.adapters.nrppa import parse_nrppa
 from rayfix_service.adapters.nrppa_documents import NrppaDocument
 from rayfix_service.adapters.silabs import SilabsDocument, parse_silabs
 from rayfix_service.adapters.ublox import parse_ublox
+from rayfix_service.http.access import client_of
 from rayfix_service.http.dependencies import LinesBody, ReportBody
 from rayfix_service.http.examples import NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.http.locating import AnswererDep, foreign
@@ -83,7 +84,10 @@ async def post_ublox(
 ) -> JSONResponse:
     """Take ``+UUDF`` lines of u-blox anchors and join them by tag and sequence number."""
     known, results = known_height(height_m, height_stdev_m), []
-    for adapted in parse_ublox(body, stations=station_map(station)):
+    messages = parse_ublox(body, stations=station_map(station))
+    if (limit := request.app.state.rate_limit) is not None:
+        limit.charge(client_of(request), len(messages) - 1)  # one was charged for the request
+    for adapted in messages:
         if await request.is_disconnected():
             raise ProblemError(CONNECTION_ENDED, "the connection ended before the answer")
         results.append(await answerer.answer_or_problem(partial(foreign, with_height(adapted, known)), output))

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
+from rayfix_service.http.access import client_of
 from rayfix_service.http.dependencies import BatchBody, ReportBody
 from rayfix_service.http.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
 from rayfix_service.http.locating import AnswererDep, native
@@ -62,6 +63,8 @@ async def post_batch(
 ) -> JSONResponse:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
     documents = _batch_reports(read_json(body))
+    if (limit := request.app.state.rate_limit) is not None:
+        limit.charge(client_of(request), len(documents) - 1)  # one was charged for the request
     results: list[dict[str, Any]] = []
     for document in documents:
         # A client that gave up waiting tends to ask again: do not compute for both.

@@ -11,6 +11,7 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 from starlette.websockets import WebSocketDisconnect
 
+from rayfix_service.http.access import client_of
 from rayfix_service.http.dependencies import TablesDep, report_limit
 from rayfix_service.http.examples import FIX_EVENT_EXAMPLE
 from rayfix_service.http.feed import FixFeed
@@ -24,6 +25,7 @@ from rayfix_service.http.problems import (
     problem_document,
     problem_responses,
 )
+from rayfix_service.http.rates import RateLimit
 from rayfix_service.wire import FixDocument, ReportDocument
 
 router = APIRouter(prefix="/v1", tags=["streams"])
@@ -110,10 +112,15 @@ async def stream(websocket: WebSocket, answerer: AnswererDep, output: Output = "
     The next message is read when the last answer is on its way, so that a client that sends faster than it is
     answered waits.
     """
-    await websocket.accept()
+    await websocket.accept(subprotocol="rayfix" if "rayfix" in websocket.scope["subprotocols"] else None)
     limit = report_limit(websocket)
+    rate: RateLimit | None = websocket.app.state.rate_limit
+    client = client_of(websocket)
     try:
         while True:
+            if rate is not None:
+                await asyncio.sleep(rate.seconds_to_wait(client))
+                rate.charge(client)
             body = await _next_message(websocket)
             answer: dict[str, Any]
             if len(body) > limit:

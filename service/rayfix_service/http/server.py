@@ -14,11 +14,12 @@ from fastapi import FastAPI
 from pydantic import TypeAdapter
 
 from rayfix_service.http.app import create_app
+from rayfix_service.http.errors import ServiceError
+from rayfix_service.http.keys import read_key_file
 from rayfix_service.http.logs import LogFormat, log_config
 from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.tables import TableFiles
-from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table
 
 SERVICE_VARIABLE = "RAYFIX_SERVICE"
@@ -28,10 +29,6 @@ _MAX_MESSAGE = 16 << 20  # bytes; up to here a message that is too long is answe
 _HANGING_SECONDS = 30  # a worker that is silent for so long is replaced; a kernel may keep it silent for some
 _FIGURES_BYTES = 8 << 20  # of some workers
 _SHUTDOWN_SECONDS = 10  # for requests under way; a full batch takes about one
-
-
-class ServiceError(RayfixError):
-    """The service cannot start."""
 
 
 def serve(
@@ -67,7 +64,8 @@ def serve(
     TableError
         When a table is missing, of another format, or damaged.
     ServiceError
-        When the port is taken, an argument is out of range, or the folder for figures cannot be written to.
+        When the port is taken, an argument is out of range, the keys are missing, or the folder for figures cannot be
+        written to.
     """
     path = Path(tables_path).absolute()
     settings = settings or ServiceSettings()
@@ -75,6 +73,13 @@ def serve(
         raise ServiceError(f"workers is {workers}; give at least 1")
     for table_path in TableFiles(path=path).find().values():
         Table.open(table_path).verify()
+    if settings.api_keys is not None:
+        read_key_file(settings.api_keys)
+    elif not is_loopback(host):
+        raise ServiceError(
+            f"host {host} can be reached from other machines, so that API keys are needed; make one with "
+            "'rayfix api-key NAME -o FILE' and give --api-keys FILE, or listen on 127.0.0.1"
+        )
     check_address(host, port)
     with ExitStack() as stack:
         app: str | FastAPI
@@ -95,6 +100,7 @@ def serve(
             ws_max_size=_MAX_MESSAGE,
             ws_per_message_deflate=False,  # costs more than it saves, on messages of a kilobyte
             timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
+            server_header=False,
             timeout_worker_healthcheck=_HANGING_SECONDS,
             access_log=False,  # this package has one of its own
             log_config=log_config(log_format, access_log=access_log),
@@ -169,14 +175,6 @@ def _check_room(folder: Path) -> None:
         ) from None
 
 
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches what listens there."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 def check_address(host: str, port: int) -> None:
     """Check that a server can listen there.
 
@@ -205,3 +203,12 @@ def check_address(host: str, port: int) -> None:
             raise ServiceError(
                 f"cannot listen on {host} port {port} ({error.strerror}); end what uses it or give another"
             ) from None
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether only this machine reaches a host's address."""
+    try:
+        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError):
+        return False
+    return all(ipaddress.ip_address(str(address[0]).partition("%")[0]).is_loopback for *_, address in found)

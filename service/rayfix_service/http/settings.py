@@ -19,8 +19,19 @@ class ServiceSettings:
     Attributes
     ----------
     body_limits : BodyLimits
+    api_keys : pathlib.Path, optional
+        File of the API keys; without it, none is asked for.
+    reports_per_second : float, optional
+        Reports that each key may send a second, on average over ``burst_seconds``, to each worker process.
+    burst_seconds : float
+    cors_origins : tuple of str
+        Origins such as ``https://maps.example.com`` whose pages may call the service from a browser.
+    fix_seconds : float
+        Time limit of a slow fix.
+    slow_fix_threads, slow_fixes_waiting : int
+        Slow fixes that are computed at a time, and that may wait for it.
     watch_seconds : float
-        Time between two looks at the files of the tables.
+        Time between two looks at the files of the tables and keys.
     simulation : bool
         Whether ``POST /v1/simulations`` answers.
     runtime_folder : pathlib.Path, optional
@@ -28,6 +39,13 @@ class ServiceSettings:
     """
 
     body_limits: BodyLimits = field(default_factory=BodyLimits)
+    api_keys: Path | None = None
+    reports_per_second: float | None = None
+    burst_seconds: float = 2.0
+    cors_origins: tuple[str, ...] = ()
+    fix_seconds: float = 10.0
+    slow_fix_threads: int = 2
+    slow_fixes_waiting: int = 32
     watch_seconds: float = 2.0
     simulation: bool = False
     runtime_folder: Path | None = None
