@@ -138,6 +138,18 @@ def _parser() -> argparse.ArgumentParser:
     api_key.add_argument("name", metavar="NAME", help="whose it is")
     api_key.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="key file, made if need be")
 
+    evaluate = add("evaluate", _evaluate, "measure how well a site can be located in, and write a report")
+    evaluate.add_argument("site", type=Path, metavar="SITE.toml")
+    evaluate.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the report")
+    evaluate.add_argument("--table", type=Path, metavar="T.h5", help="the site's table (default: it is built)")
+    evaluate.add_argument("--quick", action="store_true", help="few drops: some minutes instead of an hour")
+    evaluate.add_argument("--drops", type=_drops, metavar="N", help="drops of each study instead of the usual numbers")
+    evaluate.add_argument(
+        "--seed", type=_seed, default=2026, help="the same seed gives the same results (default: 2026)"
+    )
+    evaluate.add_argument("--jobs", type=_jobs, default=-1, help="processes (default: one per core)")
+    evaluate.add_argument("--no-progress", action="store_true", help="show no progress bar")
+
     mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: angles of Silicon Labs locators in, positions out")
     mqtt.add_argument("table", type=Path, metavar="T.h5")
     mqtt.add_argument("--broker", default="localhost", metavar="HOST[:PORT]", help="(default: localhost)")
@@ -197,6 +209,20 @@ def _rate(text: str) -> float:
     if not 0.0 < rate < 1e9:
         raise argparse.ArgumentTypeError(f"{text} is no rate; give a number of reports a second, e.g. 100")
     return rate
+
+
+def _drops(text: str) -> int:
+    drops = int(text)
+    if drops < 2:
+        raise argparse.ArgumentTypeError(f"{drops} drops have no percentiles; give 2 or more")
+    return drops
+
+
+def _seed(text: str) -> int:
+    seed = int(text)
+    if seed < 0:
+        raise argparse.ArgumentTypeError(f"{seed} is no seed; give 0 or more")
+    return seed
 
 
 def _tolerance(text: str) -> float:
@@ -352,6 +378,27 @@ def _api_key(options: argparse.Namespace) -> int:
     with needs_extra("service"):
         from rayfix_service.http.keys import add_key
     print(add_key(options.output, options.name))
+    return 0
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    with needs_extra("evaluate"):
+        from rayfix.evaluation.report.write import PAGE, run_evaluation
+
+    from rayfix.console import evaluation_progress, print_evaluation
+
+    with evaluation_progress(enabled=not options.no_progress) as progress:
+        found = run_evaluation(
+            options.site,
+            options.output,
+            table_path=options.table,
+            quick=options.quick,
+            drops=options.drops,
+            seed=options.seed,
+            jobs=options.jobs,
+            progress=progress,
+        )
+    print_evaluation(found.results, options.output / PAGE)
     return 0
 
 

@@ -2,8 +2,9 @@
 
 import resource
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
+    TaskID,
     TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
@@ -60,6 +62,58 @@ def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
         yield show
     finally:
         bar.stop()
+
+
+@contextmanager
+def evaluation_progress(*, enabled: bool) -> "Iterator[Callable[[str, int, int], None]]":
+    """Show each stage of an evaluation and the time that is left of it on standard error."""
+    if not enabled:
+        yield lambda stage, done, total: None
+        return
+    bar = Progress(
+        TextColumn("{task.description:<24}"),
+        BarColumn(bar_width=24),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(elapsed_when_finished=False, compact=True),
+        console=Console(stderr=True),
+    )
+    tasks: dict[str, TaskID] = {}
+
+    def show(stage: str, done: int, total: int) -> None:
+        # Stages of a table being built come by station and level; one bar stands for them.
+        name = stage if ":" not in stage and stage not in ("reading the scene", "writing") else "building tables"
+        if not total:
+            return
+        bar.start()
+        if name not in tasks:
+            tasks[name] = bar.add_task(name, total=total)
+        bar.update(tasks[name], completed=done, total=total)
+
+    try:
+        yield show
+    finally:
+        bar.stop()
+
+
+def print_evaluation(results: Mapping[str, Any], page: Path) -> None:
+    """Print the main figures of an evaluation and where its report is."""
+    grid = Grid(title=f"{results['site']}: error of the position, m", title_justify="left", box=box.SIMPLE_HEAD)
+    grid.add_column("measured")
+    for heading in ("rayfix 50 %", "90 %", "paper's method 50 %", "90 %", "bound 50 %", "90 %"):
+        grid.add_column(heading, justify="right")
+    (study,) = [study for study in results["studies"] if study["key"] == "methods"]
+    for point in study["points"]:
+        summaries = [point["methods"][key][name][0] for key in ("rayfix", "paper") for name in ("p50", "p90")]
+        values = [*summaries, point["bound"]["p50"], point["bound"]["p90"]]
+        grid.add_row(point["label"], *("-" if value is None else f"{value:.3f}" for value in values))
+    console = Console()
+    console.print(grid)
+    for statement in results["statements"]:
+        verdict = "holds" if statement["holds"] else "does not hold"
+        console.print(f"{statement['method']}: {statement['claim']} [bold]{verdict}[/bold]", highlight=False)
+    console.print(f"The report is {page}", highlight=False, soft_wrap=True)
 
 
 class _RateColumn(ProgressColumn):
