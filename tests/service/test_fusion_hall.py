@@ -13,9 +13,11 @@ from rayfix.evaluation.forward import ForwardSolver, Paths
 from rayfix.evaluation.simulate import Noise, Timing, simulate_report, uniform_drops
 from rayfix_service.fusion import reference
 from rayfix_service.fusion.beam import multiply
-from rayfix_service.fusion.factors import TIME_OUTLIER, Factor, make_factor
+from rayfix_service.fusion.factor_kernels import TIME_OUTLIER
+from rayfix_service.fusion.factors import Factor, make_factor
 from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.locator import Locator
+from rayfix_service.fusion.natural import unpack
 from rayfix_service.fusion.observations import sort_report
 from rayfix_service.fusion.prior import Prior, even_prior
 from rayfix_service.fusion.report import (
@@ -116,22 +118,10 @@ def factors_of(hall: Hall, report: Report, most: int, place: Array) -> tuple[lis
         )
         assert factor is not None
         near = np.diag([*np.full(3, 0.5**-2), *np.zeros(sorted_report.num_clocks)])
-        score = reference.log_integral(
-            factor.information + near,
-            factor.eta + near[:, :3] @ place,
-            factor.log_scale,
-            log_volume,
-            log_range,
-        )
+        information, eta, log_scale = unpack(factor.columns)
+        score = reference.log_integral(information + near, eta + near[:, :3] @ place, log_scale, log_volume, log_range)
         keep = np.sort(np.concatenate([np.argsort(-score[:-1])[:most], [len(factor) - 1]]))
-        factors.append(
-            Factor(
-                information=factor.information[keep],
-                eta=factor.eta[keep],
-                log_scale=factor.log_scale[keep],
-                outlier=factor.outlier[keep],
-            )
-        )
+        factors.append(Factor(columns=factor.columns[:, keep], outlier=factor.outlier[keep]))
     return factors, sorted_report.num_clocks
 
 
@@ -143,11 +133,10 @@ def exhaustive(hall: Hall, factors: list[Factor], num_clocks: int) -> tuple[Arra
     information, eta = np.zeros((1, size, size)), np.zeros((1, size))
     log_scale, score = np.full(1, -log_volume - num_clocks * log_range), np.zeros(1)
     for factor in factors:
-        parent, choice, score = reference.extend_beam(
-            information, eta, log_scale, factor.information, factor.eta, factor.log_scale, log_volume, log_range
-        )
-        information = information[parent] + factor.information[choice]
-        eta, log_scale = eta[parent] + factor.eta[choice], log_scale[parent] + factor.log_scale[choice]
+        alternatives = unpack(factor.columns)
+        parent, choice, score = reference.extend_beam(information, eta, log_scale, *alternatives, log_volume, log_range)
+        information = information[parent] + alternatives[0][choice]
+        eta, log_scale = eta[parent] + alternatives[1][choice], log_scale[parent] + alternatives[2][choice]
     placed = information[:, 0, 0] > 0.0
     information, eta = information[placed], eta[placed]
     unknown = np.diagonal(information, axis1=1, axis2=2) <= 0.0

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from rayfix_service.fusion import kernels, mode_kernels, reference
-from rayfix_service.fusion.factors import ALL_GOOD, make_factor
+from rayfix_service.fusion import beam_kernels, factor_kernels, kernels, mode_kernels, natural, reference
+from rayfix_service.fusion.factor_kernels import ALL_GOOD
+from rayfix_service.fusion.factors import make_factor
 from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.likelihood import Term, gaussian_terms, log_normal_terms, spreads
 from rayfix_service.fusion.lookup import Direction
@@ -29,6 +30,7 @@ from rayfix_tables.table import StationPart
 
 Array = NDArray[np.float64]
 Times = tuple[NDArray[np.int64], Array, Array]
+Functions = tuple[Array, Array, Array]
 
 LOG_VOLUME, LOG_RANGE = float(np.log(320.0)), float(np.log(60.0))
 
@@ -59,22 +61,31 @@ def random_mixture(rng: np.random.Generator, count: int, window: float = 0.05) -
     )
 
 
-def random_gaussians(rng: np.random.Generator, count: int) -> tuple[Array, Array, Array]:
+def random_gaussians(rng: np.random.Generator, count: int) -> Functions:
     """Log evidences, means and covariances over (x, path length)."""
     return rng.normal(size=count), rng.normal(0.0, 1.5, (count, 4)), random_cov(rng, count, [0.5, 0.7, 0.2, 0.6])
 
 
-def random_factor(rng: np.random.Generator, count: int, times: Times, dimension: int) -> tuple[Array, Array, Array]:
+def random_factor(rng: np.random.Generator, count: int, times: Times, dimension: int) -> Functions:
     """Alternatives as a report makes them, the last of them an outlier."""
     information, eta, log_scale = reference.to_information(*random_gaussians(rng, count), *times, dimension)
     information[-1], eta[-1], log_scale[-1] = 0.0, 0.0, -5.0
     return information, eta, log_scale
 
 
-def log_integrals(factor: tuple[Array, Array, Array]) -> Array:
-    size = factor[1].shape[1]
-    work, solved = np.empty((size, size)), np.empty(size)
-    return np.array([kernels.log_integral(*f, LOG_VOLUME, LOG_RANGE, work, solved) for f in zip(*factor, strict=True)])
+def log_integrals(functions: Functions) -> Array:
+    columns = natural.pack(*functions)
+    out = np.empty(columns.shape[1])
+    natural.log_integrals(columns, LOG_VOLUME, LOG_RANGE, np.empty(len(out)), out)
+    return out
+
+
+def columns_of(gaussians: Functions, times: Times, dimension: int) -> Functions:
+    """Functions that Gaussians over (x, path length) and times of arrival become, by the kernel."""
+    readings = np.array(list(zip(*times, strict=True)), factor_kernels.READING)
+    columns = np.empty((natural.triangle(dimension) + dimension + 1, len(gaussians[0])))
+    factor_kernels.to_columns(*gaussians, readings, dimension, columns)
+    return natural.unpack(columns)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -102,38 +113,79 @@ def test_condition_on_angle_equals_the_joint_gaussian(dtype: type[np.floating[An
 
 @pytest.mark.parametrize("variance", [1e-6, 0.25, 1e4])
 def test_condition_on_length_equals_the_joint_gaussian(variance: float) -> None:
-    gaussians = random_gaussians(np.random.default_rng(2), 20)
-    expected = reference.condition_on_length(*gaussians, 4.0, variance)
-    kernels.condition_on_length(*gaussians, 4.0, variance)
+    log_evidence, mean, cov = random_gaussians(np.random.default_rng(2), 20)
+    expected = reference.condition_on_length(log_evidence, mean, cov, 4.0, variance)
+    part = np.array([(0, 5, 20, 0.0, 4.0, variance, -1.0, 0, 0)], factor_kernels.PART)[0]
+    log, score = np.empty(15), np.empty(15)
+    top = factor_kernels.weigh(log_evidence, mean, cov, part, 0.0, 0.0, log, score)
+    factor_kernels.condition_on_length(mean, cov, 4.0, variance)
     # Evidences of 1e6 nats where a precise length is far off.
-    np.testing.assert_allclose(gaussians[0], expected[0], rtol=1e-11)
-    np.testing.assert_allclose(gaussians[1], expected[1], rtol=0, atol=1e-10)  # m
-    np.testing.assert_allclose(gaussians[2], expected[2], rtol=0, atol=1e-10)  # m2
+    np.testing.assert_allclose(log, expected[0][5:], rtol=1e-11)
+    np.testing.assert_array_equal(score, log - 1.0)
+    assert top == score.max()
+    np.testing.assert_allclose(mean, expected[1], rtol=0, atol=1e-10)  # m
+    np.testing.assert_allclose(cov, expected[2], rtol=0, atol=1e-10)  # m2
+
+
+@pytest.mark.parametrize("variance", [0.25, np.inf])
+def test_the_score_has_the_evidence_of_a_known_height(variance: float) -> None:
+    """As the product with a Gaussian in z, which is normalised to 1."""
+    gaussians = random_gaussians(np.random.default_rng(2), 20)
+    part = np.array([(0, 0, 20, 0.3, 4.0, variance, 0.0, 0, 0)], factor_kernels.PART)[0]
+    log, score = np.empty(20), np.empty(20)
+    z, precision = 1.2, 0.3**-2
+    factor_kernels.weigh(*gaussians, part, precision, z * precision, log, score)
+    if variance < np.inf:
+        gaussians = reference.condition_on_length(*gaussians, 4.0, variance)
+    log_norm = 0.5 * (z**2 * precision - np.log(precision / (2.0 * np.pi)))
+    expected = log + norm.logpdf(z, gaussians[1][:, 2], np.sqrt(gaussians[2][:, 2, 2] + 0.3**2)) + log_norm
+    np.testing.assert_allclose(score, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(log, gaussians[0] + 0.3, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("dimension", [3, 4, 6])
+def test_packing_goes_there_and_back(dimension: int) -> None:
+    rng = np.random.default_rng(8)
+    functions = random_cov(rng, 5, [1.0] * dimension), rng.normal(size=(5, dimension)), rng.normal(size=5)
+    for found, expected in zip(natural.unpack(natural.pack(*functions)), functions, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("size", [3, 4, 6])
+def test_inverses_of_all_matrices_are_numpys(size: int) -> None:
+    rng = np.random.default_rng(9)
+    matrices = random_cov(rng, 7, np.geomspace(0.01, 10.0, size).tolist())
+    matrices[3] -= 1.1 * np.linalg.eigvalsh(matrices[3])[0] * np.eye(size)
+    lower = np.tril_indices(size)
+    packed, det = matrices[:, lower[0], lower[1]].T.copy(), np.empty(7)
+    natural.invert_all(packed, size, det)
+    assert det[3] == 0.0
+    regular = np.arange(7) != 3
+    np.testing.assert_allclose(det[regular], np.linalg.det(matrices[regular]), rtol=1e-9)
+    expected = np.linalg.inv(matrices[regular])
+    scale = np.sqrt(np.einsum("nii,njj->nij", expected, expected))[:, lower[0], lower[1]].T
+    np.testing.assert_allclose(
+        packed[:, regular] / scale, expected[:, lower[0], lower[1]].T / scale, rtol=0, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize(("times", "dimension"), STATES)
-def test_to_information_equals_its_twin(times: Times, dimension: int) -> None:
+def test_to_columns_equals_its_twin(times: Times, dimension: int) -> None:
     gaussians = random_gaussians(np.random.default_rng(3), 12)
-    keep = np.array([7, 0, 11])
-    information, eta, log_scale = np.empty((3, dimension, dimension)), np.empty((3, dimension)), np.empty(3)
-    kernels.to_information(keep, *gaussians, *times, information, eta, log_scale)
-    log_evidence, mean, cov = gaussians
-    expected = reference.to_information(log_evidence[keep], mean[keep], cov[keep], *times, dimension)
-    np.testing.assert_allclose(information, expected[0], rtol=1e-9, atol=1e-9)  # 1 / m2
-    np.testing.assert_allclose(eta, expected[1], rtol=1e-9, atol=1e-9)  # 1 / m
-    np.testing.assert_allclose(log_scale, expected[2], rtol=1e-9, atol=1e-9)  # nats
+    expected = reference.to_information(*gaussians, *times, dimension)
+    for found, twin in zip(columns_of(gaussians, times, dimension), expected, strict=True):
+        np.testing.assert_allclose(found, twin, rtol=1e-9, atol=1e-9)  # 1 / m2, 1 / m, nats
 
 
-def test_to_information_leaves_a_degenerate_gaussian_without_weight() -> None:
-    gaussians = random_gaussians(np.random.default_rng(3), 2)
-    gaussians[2][0, 0, 0] = -1e-9  # m2
-    information, eta, log_scale = np.empty((2, 4, 4)), np.empty((2, 4)), np.empty(2)
-    kernels.to_information(np.arange(2), *gaussians, *ONE_TIME, information, eta, log_scale)
-    assert log_scale[0] == -np.inf
-    assert log_integrals((information, eta, log_scale))[0] == -np.inf
-    log_evidence, mean, cov = gaussians
-    expected = reference.to_information(log_evidence[1:], mean[1:], cov[1:], *ONE_TIME, 4)
-    np.testing.assert_allclose(log_scale[1:], expected[2], rtol=1e-9)
+@pytest.mark.parametrize("times", [NO_TIME, ONE_TIME])
+def test_to_columns_leaves_a_degenerate_gaussian_without_weight(times: Times) -> None:
+    log_evidence, mean, cov = random_gaussians(np.random.default_rng(3), 2)
+    cov[0, 0, 0] = -1e-9  # m2
+    functions = columns_of((log_evidence, mean, cov), times, 4)
+    assert functions[2][0] == -np.inf
+    assert log_integrals(functions)[0] == -np.inf
+    expected = reference.to_information(log_evidence[1:], mean[1:], cov[1:], *times, 4)
+    np.testing.assert_allclose(functions[2][1:], expected[2], rtol=1e-9)
 
 
 def test_to_information_keeps_the_evidence_of_times() -> None:
@@ -173,10 +225,9 @@ def test_extend_beam_keeps_the_best_of_all_products(seed: int, states: tuple[Tim
     first, second, dimension = states
     hypotheses = random_factor(rng, 12, first, dimension)
     factor = random_factor(rng, 15, (second[0], second[1], wide * second[2]), dimension)
-    parent, choice, score = kernels.extend_beam(*hypotheses, *factor, 40, np.inf, LOG_VOLUME, LOG_RANGE)
+    parent, choice, score = extend_beam(hypotheses, factor, 40, np.inf)
     all_parents, all_choices, all_scores = reference.extend_beam(*hypotheses, *factor, LOG_VOLUME, LOG_RANGE)
     assert len(all_scores) == 12 * 15
-    assert (np.diff(score) <= 0.0).all()
     np.testing.assert_allclose(score, all_scores[:40], rtol=0, atol=1e-7)  # nats
     clear = np.flatnonzero(-np.diff(all_scores[:41]) > 1e-6)  # before each of these ends a set without ties
     last = clear[-1] + 1
@@ -185,11 +236,21 @@ def test_extend_beam_keeps_the_best_of_all_products(seed: int, states: tuple[Tim
     assert last > 30
 
 
+def extend_beam(
+    hypotheses: Functions, factor: Functions, width: int, hopeless: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Products by the kernel, the best first."""
+    columns = natural.pack(*hypotheses), natural.pack(*factor)
+    parent, choice, score = beam_kernels.extend_beam(*columns, width, hopeless, LOG_VOLUME, LOG_RANGE)
+    order = np.argsort(-score)
+    return parent[order], choice[order], score[order]
+
+
 def test_extend_beam_takes_all_products_when_they_are_few() -> None:
     rng = np.random.default_rng(5)
     hypotheses, factor = random_factor(rng, 3, NO_TIME, 3), random_factor(rng, 4, NO_TIME, 3)
     *_, expected = reference.extend_beam(*hypotheses, *factor, LOG_VOLUME, LOG_RANGE)
-    parent, choice, score = kernels.extend_beam(*hypotheses, *factor, 256, np.inf, LOG_VOLUME, LOG_RANGE)
+    parent, choice, score = extend_beam(hypotheses, factor, 256, np.inf)
     assert sorted(zip(parent.tolist(), choice.tolist(), strict=True)) == [(h, k) for h in range(3) for k in range(4)]
     np.testing.assert_allclose(score, expected, rtol=0, atol=1e-7)  # nats
 
@@ -200,7 +261,7 @@ def test_extend_beam_gives_up_hopeless_products() -> None:
     *_, expected = reference.extend_beam(*hypotheses, *factor, LOG_VOLUME, LOG_RANGE)
     hopeful = expected > expected[0] - 30.0
     assert 1 < np.count_nonzero(hopeful) < 12
-    *_, score = kernels.extend_beam(*hypotheses, *factor, 256, 30.0, LOG_VOLUME, LOG_RANGE)
+    *_, score = extend_beam(hypotheses, factor, 256, 30.0)
     np.testing.assert_allclose(score, expected[hopeful], rtol=0, atol=1e-7)  # nats
 
 
@@ -319,11 +380,11 @@ def test_closed_form_conditioning_agrees_with_sampling(seed: int, error: str) ->
         observation, HeardStation(part), num_clocks=0, max_path_length=60.0, prior=prior, settings=fusion
     )
     assert factor is not None
-    good = factor.outlier == ALL_GOOD
-    log_evidence = log_integrals((factor.information[good], factor.eta[good], factor.log_scale[good]))
+    information, eta, log_scale = natural.unpack(factor.columns[:, factor.outlier == ALL_GOOD])
+    log_evidence = log_integrals((information, eta, log_scale))
     weight = np.exp(log_evidence - 2.0 * np.log(1.0 - fusion.outlier_probability) - log_mass)
-    cov = np.linalg.inv(factor.information[good])
-    mean = np.einsum("kij,kj->ki", cov, factor.eta[good])
+    cov = np.linalg.inv(information)
+    mean = np.einsum("kij,kj->ki", cov, eta)
     closed = weight @ mean / weight.sum()
     apart = mean - closed
     closed_cov = np.einsum("k,kij->ij", weight, cov + apart[:, :, None] * apart[:, None, :]) / weight.sum()

@@ -63,20 +63,13 @@ def multiply(
     max_divergence : float
         What such a merge may cost, nats.
     """
-    dimension = 3 + num_clocks
     log_range = math.log(max_path_length)
     # Few alternatives first: they cut the beam before it meets the many. Which of two alike comes first must not
     # depend on the report's order.
-    order = sorted(range(len(factors)), key=lambda i: (len(factors[i]), factors[i].log_scale.sum()))
-    information, eta = np.zeros((1, dimension, dimension)), np.zeros((1, dimension))
-    information[0, 2, 2], eta[0, 2] = prior.precision, prior.eta
+    order = sorted(range(len(factors)), key=lambda i: (len(factors[i]), factors[i].columns[-1].sum()))
     log_weight, mean, cov, outlier = multiply_factors(
-        information,
-        eta,
-        -num_clocks * log_range - prior.log_volume,
-        np.concatenate([factor.information for factor in factors]),
-        np.concatenate([factor.eta for factor in factors]),
-        np.concatenate([factor.log_scale for factor in factors]),
+        prior.column(num_clocks, log_range),
+        np.concatenate([factor.columns for factor in factors], axis=1),
         np.concatenate([factor.outlier for factor in factors]),
         np.cumsum([0, *(len(factor) for factor in factors)]),
         np.array(order),
@@ -90,5 +83,5 @@ def multiply(
         mean=mean,
         cov=cov,
         outlier=outlier,
-        log_lost=sum(float(factor.log_scale[-1]) for factor in factors),
+        log_lost=sum(float(factor.columns[-1, -1]) for factor in factors),
     )

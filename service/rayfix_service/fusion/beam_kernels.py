@@ -1,12 +1,12 @@
-"""The compiled loop of :mod:`rayfix_service.fusion.beam`."""
+"""The compiled loop of :mod:`rayfix_service.fusion.beam`, on columns of :mod:`rayfix_service.fusion.natural`."""
 
 from typing import Any
 
 import numba
 import numpy as np
 
-from rayfix_service.fusion.kernels import cholesky, extend_beam, invert
 from rayfix_service.fusion.merging import merge_hypotheses
+from rayfix_service.fusion.natural import add, dimension_of, invert_all, log_integrals, triangle
 
 HOPELESS = 20.0
 """A product this many nats below the best is given up: more than one station to come would have to be an outlier."""
@@ -14,13 +14,9 @@ HOPELESS = 20.0
 
 @numba.njit(cache=True, nogil=True)
 def multiply_factors(
-    information: Any,
-    eta: Any,
-    log_scale: Any,
-    factor_information: Any,
-    factor_eta: Any,
-    factor_scale: Any,
-    factor_outlier: Any,
+    prior: Any,
+    alternatives: Any,
+    outlier: Any,
     offsets: Any,
     order: Any,
     width: Any,
@@ -32,15 +28,12 @@ def multiply_factors(
 
     Parameters
     ----------
-    information : ndarray of shape (1, d, d)
-        Of the prior.
-    eta : ndarray of shape (1, d)
-    log_scale : float
-    factor_information : ndarray of shape (k, d, d)
-        Alternatives of all factors.
-    factor_eta : ndarray of shape (k, d)
-    factor_scale : ndarray of shape (k,)
-    factor_outlier : ndarray of int8, shape (k,)
+    prior : ndarray of shape (rows, 1)
+        Of the state.
+    alternatives : ndarray of shape (rows, k)
+        Of all factors.
+    outlier : ndarray of int8, shape (k,)
+        What each takes for an outlier.
     offsets : ndarray of int64, shape (n + 1,)
         Alternatives of factor f are those from ``offsets[f]`` to ``offsets[f + 1]``.
     order : ndarray of int64, shape (n,)
@@ -50,7 +43,7 @@ def multiply_factors(
     max_divergence : float
         What a merge may cost, nats.
     log_volume, log_range : float
-        As in :func:`~rayfix_service.fusion.kernels.log_integral`.
+        As in :func:`~rayfix_service.fusion.natural.log_integrals`.
 
     Returns
     -------
@@ -60,72 +53,135 @@ def multiply_factors(
     cov : ndarray of shape (h, 3, 3), m2
     outlier : ndarray of int8, shape (h, n)
     """
-    size = eta.shape[1]
-    num_factors = len(order)
-    scale = np.full(1, log_scale)
-    chosen = np.zeros((1, num_factors), np.int8)
+    beam = prior
+    chosen = np.zeros((1, len(order)), np.int8)
     pattern = np.zeros(1, np.int64)
     score = np.zeros(1)
     for factor in order:
         begin, stop = offsets[factor], offsets[factor + 1]
-        parent, choice, score = extend_beam(
-            information,
-            eta,
-            scale,
-            factor_information[begin:stop],
-            factor_eta[begin:stop],
-            factor_scale[begin:stop],
-            width,
-            HOPELESS,
-            log_volume,
-            log_range,
-        )
-        count = len(parent)
-        next_information, next_eta = np.empty((count, size, size)), np.empty((count, size))
-        next_scale, next_pattern = np.empty(count), np.empty(count, np.int64)
-        for n in range(count):
-            h, k = parent[n], begin + choice[n]
-            for i in range(size):
-                next_eta[n, i] = eta[h, i] + factor_eta[k, i]
-                for j in range(size):
-                    next_information[n, i, j] = information[h, i, j] + factor_information[k, i, j]
-            next_scale[n] = scale[h] + factor_scale[k]
-            next_pattern[n] = 3 * pattern[h] + factor_outlier[k]
-        left = merge_hypotheses(next_information, next_eta, next_scale, score, next_pattern, max_divergence)
+        own = np.ascontiguousarray(alternatives[:, begin:stop])
+        parent, choice, score = extend_beam(beam, own, width, HOPELESS, log_volume, log_range)
+        product = np.empty((len(beam), len(score)))
+        next_pattern = np.empty(len(score), np.int64)
+        for n in range(len(score)):
+            next_pattern[n] = 3 * pattern[parent[n]] + outlier[begin + choice[n]]
+        for row in range(len(beam)):
+            for n in range(len(score)):
+                product[row, n] = beam[row, parent[n]] + own[row, choice[n]]
+        left = merge_hypotheses(product, score, next_pattern, max_divergence)
         left = left[np.argsort(-score[left], kind="mergesort")]
-        next_chosen = np.empty((len(left), num_factors), np.int8)
+        next_chosen = np.empty((len(left), len(order)), np.int8)
         for n in range(len(left)):
-            for i in range(num_factors):
-                next_chosen[n, i] = chosen[parent[left[n]], i]
-            next_chosen[n, factor] = factor_outlier[begin + choice[left[n]]]
-        information, eta, scale = next_information[left], next_eta[left], next_scale[left]
+            next_chosen[n] = chosen[parent[left[n]]]
+            next_chosen[n, factor] = outlier[begin + choice[left[n]]]
+        beam = np.empty((len(product), len(left)))
+        for row in range(len(product)):
+            for n in range(len(left)):
+                beam[row, n] = product[row, left[n]]
         score, pattern, chosen = score[left], next_pattern[left], next_chosen
-    return _placed(information, eta, score, chosen)
+    return _placed(beam, score, chosen)
 
 
 @numba.njit(cache=True, nogil=True)
-def _placed(information: Any, eta: Any, score: Any, chosen: Any) -> Any:
+def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: Any, log_range: Any) -> Any:
+    """Multiply every hypothesis by every alternative of a factor and keep the best products.
+
+    Parameters
+    ----------
+    beam : ndarray of shape (rows, h)
+        Hypotheses; the better come first for speed alone.
+    factor : ndarray of shape (rows, k)
+        Alternatives.
+    width : int
+        Products to keep.
+    hopeless : float
+        Products this many nats below the best are given up.
+    log_volume, log_range : float
+        As in :func:`~rayfix_service.fusion.natural.log_integrals`.
+
+    Returns
+    -------
+    parent, choice : ndarray of int64, shape (n,)
+        Hypothesis and alternative of each product, in no order.
+    score : ndarray of shape (n,)
+        Log evidence of each product.
+    """
+    count = factor.shape[1]
+    products = np.empty(factor.shape)
+    values, scratch = np.empty(count), np.empty(count)
+    most = min(width, beam.shape[1] * count)
+    parent, choice = np.empty(most, np.int64), np.empty(most, np.int64)
+    score = np.empty(most)
+    heap = np.empty(most, np.int64)
+    kept = 0
+    top = -np.inf
+    for h in range(beam.shape[1]):
+        add(beam, h, factor, products)
+        log_integrals(products, log_volume, log_range, scratch, values)
+        for k in range(count):
+            value = values[k]
+            if not value >= top - hopeless:
+                continue
+            top = max(top, value)
+            if kept < most:
+                parent[kept], choice[kept], score[kept] = h, k, value
+                _sift_up(score, heap, kept)
+                kept += 1
+            elif value > score[heap[0]]:
+                slot = heap[0]
+                parent[slot], choice[slot], score[slot] = h, k, value
+                _sift_down(score, heap, kept)
+    hopeful = np.flatnonzero(score[:kept] >= top - hopeless)
+    return parent[hopeful], choice[hopeful], score[hopeful]
+
+
+@numba.njit(cache=True, nogil=True)
+def _sift_up(scores: Any, heap: Any, last: Any) -> None:
+    """Take the entry ``last``, which has come to it, into the heap whose least score is at ``heap[0]``."""
+    i = last
+    heap[i] = last
+    while i > 0 and scores[heap[(i - 1) // 2]] > scores[heap[i]]:
+        up = (i - 1) // 2
+        heap[i], heap[up] = heap[up], heap[i]
+        i = up
+
+
+@numba.njit(cache=True, nogil=True)
+def _sift_down(scores: Any, heap: Any, count: Any) -> None:
+    """Restore the heap whose least score is at ``heap[0]``, after that entry has changed."""
+    i = 0
+    while True:
+        least = i
+        for child in (2 * i + 1, 2 * i + 2):
+            if child < count and scores[heap[child]] < scores[heap[least]]:
+                least = child
+        if least == i:
+            return
+        heap[i], heap[least] = heap[least], heap[i]
+        i = least
+
+
+@numba.njit(cache=True, nogil=True)
+def _placed(beam: Any, score: Any, chosen: Any) -> Any:
     """Means and covariances of the position, of the hypotheses that say something of it."""
-    count, size = eta.shape
-    placed = np.empty(count, np.int64)
-    mean, cov = np.empty((count, 3)), np.empty((count, 3, 3))
-    lower, inverse = np.empty((size, size)), np.empty((size, size))
-    num = 0
-    for h in range(count):
-        for clock in range(3, size):
-            # Of a clock that nothing constrains only this entry is not zero; it changes nothing else.
-            if information[h, clock, clock] <= 0.0:
-                information[h, clock, clock] = 1.0
-        if not (information[h, 0, 0] > 0.0 and score[h] > -np.inf and cholesky(information[h], lower)):
-            continue
-        invert(lower, inverse)
+    dimension = dimension_of(beam)
+    first = triangle(dimension)
+    cov = beam.copy()
+    for clock in range(3, dimension):
+        pivot = cov[triangle(clock) + clock]
+        for h in range(len(pivot)):
+            if pivot[h] <= 0.0:
+                # Of a clock that nothing constrains only this entry is not zero; it changes nothing else.
+                pivot[h] = 1.0
+    det = np.empty(len(score))
+    invert_all(cov, dimension, det)
+    placed = np.flatnonzero((beam[0] > 0.0) & (score > -np.inf) & (det > 0.0))
+    means, covs = np.zeros((len(placed), 3)), np.empty((len(placed), 3, 3))
+    for n in range(len(placed)):
+        h = placed[n]
         for i in range(3):
-            mean[num, i] = 0.0
-            for j in range(size):
-                mean[num, i] += inverse[i, j] * eta[h, j]
+            for j in range(dimension):
+                means[n, i] += cov[triangle(max(i, j)) + min(i, j), h] * beam[first + j, h]
             for j in range(3):
-                cov[num, i, j] = inverse[i, j]
-        placed[num] = h
-        num += 1
-    placed = placed[:num]
-    return score[placed], mean[:num].copy(), cov[:num].copy(), chosen[placed]
+                covs[n, i, j] = cov[triangle(max(i, j)) + min(i, j), h]
+    return score[placed], means, covs, chosen[placed]

@@ -10,43 +10,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.clocks import ClockReading
-from rayfix_service.fusion.heard import HeardStation
-from rayfix_service.fusion.kernels import condition_on_length, to_information
+from rayfix_service.fusion.factor_kernels import ALL_GOOD, PART, READING, TIME_OUTLIER, make_alternatives
+from rayfix_service.fusion.heard import HeardStation, join
 from rayfix_service.fusion.likelihood import Term, product, total_variance
 from rayfix_service.fusion.lookup import Direction
-from rayfix_service.fusion.merging import merge_alternatives
 from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.settings import FusionSettings
 
-_RELAXED = math.log(8.0)
-"""Alternatives of a kind that is improbable are merged at up to this many times the divergence (its logarithm)."""
-
-ALL_GOOD, TIME_OUTLIER, ALL_OUTLIER = 0, 1, 2
-"""What an alternative takes for an outlier: nothing, the observation's times, or all of it."""
+_ANY_LENGTH = Term(0.0, 0.0, math.inf)
+"""Likelihood of a path length that was not measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Factor:
-    """Alternatives ``exp(log_scale + eta . z - z . information . z / 2)`` over z = (x, clock offsets).
+    """Alternatives for what one path of the report says of the state z = (x, clock offsets).
 
     Attributes
     ----------
-    information : ndarray of shape (k, d, d)
-    eta : ndarray of shape (k, d)
-    log_scale : ndarray of shape (k,)
+    columns : ndarray of shape (rows, k)
+        One alternative each, as :mod:`rayfix_service.fusion.natural` has them.
     outlier : ndarray of int8, shape (k,)
         ALL_GOOD, TIME_OUTLIER or ALL_OUTLIER; the last alternative is always ALL_OUTLIER.
     """
 
-    information: NDArray[np.float64]
-    eta: NDArray[np.float64]
-    log_scale: NDArray[np.float64]
+    columns: NDArray[np.float64]
     outlier: NDArray[np.int8]
 
     def __len__(self) -> int:
         """Return the number of alternatives."""
-        return len(self.log_scale)
+        return len(self.outlier)
 
 
 def make_factor(
@@ -71,85 +64,83 @@ def make_factor(
     log_any_time = -sum(math.log(max_path_length + math.sqrt(2.0 * math.pi * v)) for v in _variances(observation))
     log_good, log_bad = math.log1p(-settings.outlier_probability), math.log(settings.outlier_probability)
     log_outlier = log_bad + log_any_time - _log_angle_range(observation)
-    timed = bool(observation.lengths or observation.readings)
-    parts: list[_Part] = []
-    for log_spread, scale in observation.angle_spreads:
-        log_evidence, mean, cov = station.towards(_widened(observation.direction, scale))
-        if not len(log_evidence):
-            continue
-        log_evidence += log_good + log_spread
-        if observation.angle_index is None or not timed:
-            parts += _good_parts(log_evidence, mean, cov, observation, max_path_length)
-            continue
-        parts += _good_parts(log_evidence + log_good, mean.copy(), cov.copy(), observation, max_path_length)
-        parts.append(_Part(TIME_OUTLIER, log_evidence + (log_bad + log_any_time), mean, cov, (), 0.0))
-    if not parts:
+    heard = [station.towards(_widened(observation.direction, spread.scale)) for spread in observation.angle_spreads]
+    bounds = [0, *itertools.accumulate(len(gaussians) for gaussians in heard)]
+    if bounds[-1] == 0:
         return None
-    parts.sort(key=lambda part: part.kind)
-    scores = [p.log_evidence + p.log_clocks + prior.log_gain(p.mean, p.cov) for p in parts]
-    top = max(log_outlier + prior.log_volume, *(float(score.max()) for score in scores))
-    floor = top + math.log(settings.component_floor)
-    keeps = []
-    for part, score in zip(parts, scores, strict=True):
-        # The divergence of all parts together is what counts, though a part may turn out to be the right one.
-        allowed = settings.max_divergence * math.exp(min(top - float(score.max()), _RELAXED))
-        keep = np.flatnonzero(score > floor)
-        keeps.append(merge_alternatives(keep, part.log_evidence, part.mean, part.cov, allowed))
-    return _alternatives(parts, keeps, log_outlier, 3 + num_clocks)
+    timed = bool(observation.lengths or observation.readings)
+    may_be_late = timed and observation.angle_index is not None
+    kinds, readings = _good_kinds(observation, max_path_length)
+    if may_be_late:
+        kinds = [kind._replace(log_weight=kind.log_weight + log_good) for kind in kinds]
+        kinds.append(_Kind(TIME_OUTLIER, log_bad + log_any_time, *_ANY_LENGTH[1:]))
+    columns, outlier = make_alternatives(
+        *join(heard),
+        np.array(
+            [
+                (kind.outlier, begin, stop, log_good + spread.log_weight + kind.log_weight, *kind[2:])
+                for kind in kinds
+                for spread, (begin, stop) in zip(observation.angle_spreads, itertools.pairwise(bounds), strict=True)
+            ],
+            PART,
+        ),
+        np.array(readings, READING),
+        num_clocks,
+        prior.precision,
+        prior.eta,
+        prior.log_volume,
+        log_outlier,
+        math.log(settings.component_floor),
+        settings.max_divergence,
+    )
+    return Factor(columns=columns, outlier=outlier)
 
 
-class _Part(NamedTuple):
-    """Alternatives of one kind, before the readings of clocks, and the logarithm of what those will cost at least."""
+class _Kind(NamedTuple):
+    """Alternatives of one kind, as :data:`PART` has them, for Gaussians of any spread."""
 
-    kind: int
-    log_evidence: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    cov: NDArray[np.float64]
-    readings: tuple[ClockReading, ...]
-    log_clocks: float
+    outlier: int
+    log_weight: float
+    length: float
+    length_variance: float
+    log_clocks: float = 0.0
+    first_reading: int = 0
+    last_reading: int = 0
 
 
-def _good_parts(
-    log_evidence: NDArray[np.float64],
-    mean: NDArray[np.float64],
-    cov: NDArray[np.float64],
-    observation: Observation,
-    max_path_length: float,
-) -> Iterator[_Part]:
+def _good_kinds(observation: Observation, max_path_length: float) -> tuple[list[_Kind], list[tuple[int, float, float]]]:
     """Alternatives for which all times are what they seem, of each combination of the Gaussians of their errors.
 
-    The arrays may be overwritten.
+    Also gives the readings of clocks that these take in, as :data:`READING` has them.
     """
-    combinations = list(itertools.product(_joint_lengths(observation), _joint_readings(observation.readings)))
     # Readings are not in the evidence yet; what each clock will cost, whatever it shows, is its even prior.
     log_clocks = -len({reading.clock for reading in observation.readings}) * math.log(max_path_length)
-    for n, (length, (log_weight, readings)) in enumerate(combinations, start=1):
-        last = n == len(combinations)
-        own = (log_evidence, mean, cov) if last else (log_evidence.copy(), mean.copy(), cov.copy())
-        if length is not None:
-            condition_on_length(*own, length.value, length.variance)
-            log_weight += length.log_weight
-        own[0][:] += log_weight
-        yield _Part(ALL_GOOD, *own, readings, log_clocks)
+    kinds = []
+    readings: list[tuple[int, float, float]] = []
+    for log_weight, joint in _joint_readings(observation.readings):
+        first, last = len(readings), len(readings) + len(joint)
+        readings += joint
+        kinds += [
+            _Kind(ALL_GOOD, log_weight + length.log_weight, length.value, length.variance, log_clocks, first, last)
+            for length in _joint_lengths(observation)
+        ]
+    return kinds, readings
 
 
-def _joint_lengths(observation: Observation) -> list[Term | None]:
+def _joint_lengths(observation: Observation) -> list[Term]:
     """Gaussians over the path length that all measured lengths together make."""
     if not observation.lengths:
-        return [None]
+        return [_ANY_LENGTH]
     return [product(terms, observation.length_bias_variance) for terms in itertools.product(*observation.lengths)]
 
 
-def _joint_readings(readings: tuple[ClockReading, ...]) -> list[tuple[float, tuple[ClockReading, ...]]]:
+def _joint_readings(readings: tuple[ClockReading, ...]) -> Iterator[tuple[float, list[tuple[int, float, float]]]]:
     """Combine the Gaussians that readings may be of, each with the logarithm of their probability."""
-    combinations = itertools.product(*(reading.spreads for reading in readings))
-    return [
-        (
+    for spreads in itertools.product(*(reading.spreads for reading in readings)):
+        yield (
             sum(spread.log_weight for spread in spreads),
-            tuple(replace(r, variance=r.variance * s.scale**2) for r, s in zip(readings, spreads, strict=True)),
+            [(r.clock, r.offset, r.variance * s.scale**2) for r, s in zip(readings, spreads, strict=True)],
         )
-        for spreads in combinations
-    ]
 
 
 def _variances(observation: Observation) -> list[float]:
@@ -164,49 +155,6 @@ def _variances(observation: Observation) -> list[float]:
 
 def _widened(measured: Direction, scale: float) -> Direction:
     return measured if scale == 1.0 else replace(measured, cov=scale**2 * measured.cov)
-
-
-_NO_READINGS = (np.empty(0, np.int64), np.empty(0), np.empty(0))
-
-
-def _columns(
-    readings: tuple[ClockReading, ...],
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Clocks, offsets and variances of readings."""
-    return (
-        np.array([r.clock for r in readings], np.int64),
-        np.array([r.offset for r in readings]),
-        np.array([r.variance for r in readings]),
-    )
-
-
-def _alternatives(
-    parts: list[_Part],
-    keeps: list[NDArray[np.int64]],
-    log_outlier: float,
-    dimension: int,
-) -> Factor:
-    """Factor of those alternatives of each part that are kept, and the outlier."""
-    total = sum(len(keep) for keep in keeps) + 1
-    information = np.zeros((total, dimension, dimension))
-    eta, log_scale = np.zeros((total, dimension)), np.full(total, log_outlier)
-    outlier = np.full(total, ALL_OUTLIER, np.int8)
-    begin = 0
-    for part, keep in zip(parts, keeps, strict=True):
-        out = slice(begin, begin + len(keep))
-        to_information(
-            keep,
-            part.log_evidence,
-            part.mean,
-            part.cov,
-            *(_columns(part.readings) if part.readings else _NO_READINGS),
-            information[out],
-            eta[out],
-            log_scale[out],
-        )
-        outlier[out] = part.kind
-        begin = out.stop
-    return Factor(information=information, eta=eta, log_scale=log_scale, outlier=outlier)
 
 
 def _log_angle_range(observation: Observation) -> float:

@@ -1,5 +1,6 @@
 """What a station's part of the table says of a measured direction, as Gaussians over (position, path length)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.kernels import condition_on_angle
 from rayfix_service.fusion.lookup import NO_DIRECTION, Direction, Lookup, look_up
-from rayfix_service.fusion.merging import merge_alternatives
+from rayfix_service.fusion.merging import merge_gaussians
 from rayfix_tables.table import StationPart
 
 _RANGE_STDEV = 0.1
@@ -37,9 +38,10 @@ class Heard(NamedTuple):
         """Return the number of Gaussians."""
         return len(self.log_evidence)
 
-    def copy(self) -> "Heard":
-        """Return arrays that may be overwritten."""
-        return Heard(*(array.copy() for array in self))
+
+def join(parts: Sequence[Heard]) -> Heard:
+    """Gaussians of all parts."""
+    return parts[0] if len(parts) == 1 else Heard(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -49,20 +51,16 @@ class HeardStation:
     part: StationPart
 
     def towards(self, measured: Direction) -> Heard:
-        """Gaussians of the paths from a measured direction; none where no ray comes. They may be overwritten."""
+        """Gaussians of the paths from a measured direction; none where no ray comes."""
         if measured.azimuth is None and measured.zenith is None:
-            return self.everywhere.copy()
+            return self.everywhere
         return _condition(look_up(self.part.levels, measured))
 
     @cached_property
     def everywhere(self) -> Heard:
         """Gaussians of the paths of all directions, those merged that no path length tells apart."""
         heard = _condition(look_up(self.part.levels, NO_DIRECTION))
-        if not len(heard):
-            return heard
-        left = merge_alternatives(
-            np.arange(len(heard)), *heard, _MAX_DIVERGENCE, noise=np.array([0.0, 0.0, 0.0, _RANGE_STDEV**2])
-        )
+        left = merge_gaussians(*heard, np.array([0.0, 0.0, 0.0, _RANGE_STDEV**2]), _MAX_DIVERGENCE)
         return Heard(*(array[left] for array in heard))
 
 

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.beam import Hypotheses, multiply
 from rayfix_service.fusion.credible import CredibleRegions, posterior_points
-from rayfix_service.fusion.factors import ALL_GOOD, ALL_OUTLIER, Factor, make_factor
+from rayfix_service.fusion.factor_kernels import ALL_GOOD, ALL_OUTLIER
+from rayfix_service.fusion.factors import Factor, make_factor
 from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.modes import cut_to_free_space, find_modes, unit_points
 from rayfix_service.fusion.normal import normal_points

@@ -9,73 +9,54 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from rayfix_service.fusion.kernels import LOG_2PI, cholesky, invert
+from rayfix_service.fusion.kernels import LOG_2PI
+from rayfix_service.fusion.natural import dimension_of, invert_all, triangle
 from rayfix_tables.halving import halve_and_merge
 
-_NO_NOISE = np.zeros(4)
 
-
-def merge_alternatives(
-    keep: NDArray[np.int64],
-    log_evidence: NDArray[np.float64],
-    mean: NDArray[np.float64],
-    cov: NDArray[np.float64],
-    max_divergence: float,
-    noise: NDArray[np.float64] = _NO_NOISE,
-) -> NDArray[np.int64]:
-    """Merge weighted Gaussians over (position, path length), in place.
+@numba.njit(cache=True, nogil=True)
+def merge_gaussians(log_weight: Any, mean: Any, cov: Any, noise: Any, max_divergence: Any) -> Any:
+    """Merge weighted Gaussians, in place.
 
     Parameters
     ----------
-    keep : ndarray of int64, shape (n,)
-        Gaussians that count; the others stay as they are.
-    log_evidence : ndarray of shape (k,)
-    mean : ndarray of shape (k, 4), m
-    cov : ndarray of shape (k, 4, 4), m2
+    log_weight : ndarray of shape (n,)
+    mean : ndarray of shape (n, d)
+    cov : ndarray of shape (n, d, d)
+    noise : ndarray of shape (d,)
+        Variances under which Gaussians are told apart.
     max_divergence : float
         What a merge may cost, nats.
-    noise : ndarray of shape (4,), m2
-        Variances under which Gaussians are told apart.
 
     Returns
     -------
     ndarray of int64, shape (m,)
-        Those of ``keep`` that are left.
+        Those that are left.
     """
-    if len(keep) < 2:
-        return keep
-    return np.asarray(_merge_gaussians(keep, log_evidence, mean, cov, max_divergence, noise))
-
-
-@numba.njit(cache=True, nogil=True)
-def _merge_gaussians(keep: Any, log_evidence: Any, mean: Any, cov: Any, max_divergence: Any, noise: Any) -> Any:
-    logs = log_evidence[keep]
-    top = logs.max()
-    weight = np.exp(logs - top)
+    count, size = mean.shape
+    if count < 2:
+        return np.arange(count)
+    top = log_weight.max()
+    weight = np.exp(log_weight - top)
     total = weight.sum()
     weight /= total
-    means, covs = mean[keep], cov[keep]
-    size = means.shape[1]
-    one_group = np.zeros(len(keep), np.int64)
-    into = halve_and_merge(weight, means, covs, one_group, np.ones(size), noise, max_divergence)
-    left = np.flatnonzero(into == np.arange(len(keep)))
+    one_group = np.zeros(count, np.int64)
+    into = halve_and_merge(weight, mean, cov, one_group, np.ones(size), noise, max_divergence)
+    left = np.flatnonzero(into == np.arange(count))
     for n in left:
-        log_evidence[keep[n]] = np.log(weight[n] * total) + top
-        mean[keep[n]], cov[keep[n]] = means[n], covs[n]
-    return keep[left]
+        log_weight[n] = np.log(weight[n] * total) + top
+    return left
 
 
 @numba.njit(cache=True, nogil=True)
-def merge_hypotheses(information: Any, eta: Any, log_scale: Any, score: Any, pattern: Any, max_divergence: Any) -> Any:
+def merge_hypotheses(columns: Any, score: Any, pattern: Any, max_divergence: Any) -> Any:
     """Merge products of factors, in place.
 
     Parameters
     ----------
-    information : ndarray of shape (h, d, d)
-    eta : ndarray of shape (h, d)
-    log_scale : ndarray of shape (h,)
+    columns : ndarray of shape (rows, h)
+        As :mod:`rayfix_service.fusion.natural` has them.
     score : ndarray of shape (h,)
         Log evidence.
     pattern : ndarray of int64, shape (h,)
@@ -88,49 +69,68 @@ def merge_hypotheses(information: Any, eta: Any, log_scale: Any, score: Any, pat
     ndarray of int64, shape (m,)
         Products that are left.
     """
-    count, size = eta.shape
-    proper = np.empty(count, np.int64)
-    stays = np.ones(count, np.bool_)
-    mean, cov = np.empty((count, size)), np.empty((count, size, size))
-    lower = np.empty((size, size))
-    num = 0
-    for h in range(count):
-        # A hypothesis that leaves something open is no Gaussian.
-        if score[h] > -np.inf and cholesky(information[h], lower):
-            invert(lower, cov[num])
-            for i in range(size):
-                mean[num, i] = 0.0
-                for j in range(size):
-                    mean[num, i] += cov[num, i, j] * eta[h, j]
-            proper[num] = h
-            num += 1
-    if num == 0:
-        return np.arange(count)
-    proper, mean, cov = proper[:num], mean[:num], cov[:num]
-    top = score[proper[0]]
-    for n in range(num):
-        top = max(top, score[proper[n]])
+    size = dimension_of(columns)
+    packed, det = columns.copy(), np.empty(len(score))
+    invert_all(packed, size, det)
+    # A hypothesis that leaves something open is no Gaussian.
+    proper = np.flatnonzero((score > -np.inf) & (det > 0.0))
+    if len(proper) == 0:
+        return np.arange(len(score))
+    top = score[proper].max()
     weight = np.exp(score[proper] - top)
     total = weight.sum()
     weight /= total
+    mean, cov = _moments(columns, packed, proper)
     into = halve_and_merge(weight, mean, cov, pattern[proper], np.ones(size), np.zeros(size), max_divergence)
-    grown = np.zeros(num, np.bool_)
-    for n in range(num):
+    stays, has_grown = np.ones(len(score), np.bool_), np.zeros(len(proper), np.bool_)
+    for n in range(len(proper)):
         if into[n] != n:
-            grown[into[n]] = True
             stays[proper[n]] = False
-    for n in range(num):
-        if not grown[n] or not weight[n] > 0.0 or not cholesky(cov[n], lower):
-            continue
-        h = proper[n]
-        score[h] = np.log(weight[n] * total) + top
-        invert(lower, information[h])
-        log_scale[h] = score[h] - 0.5 * size * LOG_2PI
-        for i in range(size):
-            log_scale[h] -= np.log(lower[i, i])
-            eta[h, i] = 0.0
-            for j in range(size):
-                eta[h, i] += information[h, i, j] * mean[n, j]
-        for i in range(size):
-            log_scale[h] -= 0.5 * eta[h, i] * mean[n, i]
+            has_grown[into[n]] = weight[into[n]] > 0.0
+    grown = np.flatnonzero(has_grown)
+    _write_back(columns, score, proper[grown], np.log(weight[grown] * total) + top, mean[grown], cov[grown])
     return np.flatnonzero(stays)
+
+
+@numba.njit(cache=True, nogil=True)
+def _moments(columns: Any, packed: Any, which: Any) -> Any:
+    """Means and covariances of columns, the latter given as packed triangles."""
+    size = dimension_of(columns)
+    first = triangle(size)
+    mean, cov = np.zeros((len(which), size)), np.empty((len(which), size, size))
+    for n in range(len(which)):
+        h = which[n]
+        for i in range(size):
+            for j in range(i + 1):
+                cov[n, i, j] = packed[triangle(i) + j, h]
+                cov[n, j, i] = cov[n, i, j]
+        for i in range(size):
+            for j in range(size):
+                mean[n, i] += cov[n, i, j] * columns[first + j, h]
+    return mean, cov
+
+
+@numba.njit(cache=True, nogil=True)
+def _write_back(columns: Any, score: Any, which: Any, log_weight: Any, mean: Any, cov: Any) -> None:
+    """Turn weighted Gaussians into columns, where their covariances are regular."""
+    size = mean.shape[1]
+    first = triangle(size)
+    packed, det = np.empty((first, len(which))), np.empty(len(which))
+    for n in range(len(which)):
+        for i in range(size):
+            for j in range(i + 1):
+                packed[triangle(i) + j, n] = cov[n, i, j]
+    invert_all(packed, size, det)
+    for n in range(len(which)):
+        if not det[n] > 0.0:
+            continue
+        h = which[n]
+        score[h] = log_weight[n]
+        columns[-1, h] = log_weight[n] - 0.5 * (size * LOG_2PI + np.log(det[n]))
+        for i in range(size):
+            columns[first + i, h] = 0.0
+            for j in range(size):
+                row = triangle(max(i, j)) + min(i, j)
+                columns[row, h] = packed[row, n]
+                columns[first + i, h] += packed[row, n] * mean[n, j]
+            columns[-1, h] -= 0.5 * columns[first + i, h] * mean[n, i]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_service.fusion.natural import triangle
 from rayfix_service.fusion.report import Height
 from rayfix_tables.errors import ReportError
 from rayfix_tables.freespace import FreeSpace
@@ -38,23 +39,21 @@ class Prior:
     precision: float = 0.0
     eta: float = 0.0
 
-    def log_gain(self, mean: NDArray[np.float64], cov: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Logarithm of the integral of Gaussians over position (and more) times ``exp(eta z - precision z^2 / 2)``.
+    def column(self, num_clocks: int, log_range: float) -> NDArray[np.float64]:
+        """Prior of position and clocks as :mod:`rayfix_service.fusion.natural` has it, shape (rows, 1).
 
         Parameters
         ----------
-        mean : ndarray of shape (k, d), m
-            Of which the third column is z.
-        cov : ndarray of shape (k, d, d), m2
+        num_clocks : int
+        log_range : float
+            Natural logarithm of the range [m] in which a clock's offset lies evenly.
         """
-        if self.precision == 0.0:
-            return np.zeros(len(mean))
-        z, variance = mean[:, 2], cov[:, 2, 2]
-        shrunk = 1.0 + self.precision * variance
-        # Completing the square; (eta - precision z) is the pull towards the known height.
-        pull = self.eta - self.precision * z
-        gain = z * (self.eta - 0.5 * self.precision * z) + 0.5 * (pull**2 * variance / shrunk - np.log(shrunk))
-        return np.asarray(gain)
+        dimension = 3 + num_clocks
+        column = np.zeros((triangle(dimension) + dimension + 1, 1))
+        column[triangle(3) - 1] = self.precision
+        column[triangle(dimension) + 2] = self.eta
+        column[-1] = -num_clocks * log_range - self.log_volume
+        return column
 
 
 def even_prior(free_space: FreeSpace) -> Prior:
