@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.kernels import cholesky
+from rayfix_service.fusion.voxels import is_free
 from rayfix_tables.freespace import FreeSpace
 
 
@@ -71,8 +72,7 @@ class CredibleRegions:
 
         It has the shape of the best candidate's covariance or of the whole posterior's, whichever makes it smaller.
         """
-        apart = self.points - self.position
-        whole = apart.T @ apart / len(apart) + 1e-9 * self.covariance
+        whole = _second_moment(self.points, self.position) + 1e-9 * self.covariance
         return min((self._scaled(shape, probability) for shape in (self.covariance, whole)), key=_volume)
 
     def upright_ellipsoid(self, probability: float) -> Ellipsoid:
@@ -91,9 +91,7 @@ class CredibleRegions:
         return self._quantile(np.abs(self.points[:, 2] - self.position[2]), probability)
 
     def _scaled(self, shape: NDArray[np.float64], probability: float) -> Ellipsoid:
-        apart = self.points - self.position
-        squares = np.einsum("ni,ij,nj->n", apart, np.linalg.inv(shape), apart)
-        radius = self._quantile(squares, probability)
+        radius = self._quantile(_squared_distances(self.points, self.position, shape), probability)
         return Ellipsoid(
             centre=self.position, shape=max(radius, 1e-12) * shape, probability=min(probability, self.share)
         )
@@ -156,14 +154,43 @@ def _all_points(
 
 
 @numba.njit(cache=True, nogil=True)
+def _second_moment(points: Any, centre: Any) -> Any:
+    """Second moment of points about a centre, shape (3, 3), m2."""
+    moment = np.zeros((3, 3))
+    for n in range(len(points)):
+        x, y, z = points[n, 0] - centre[0], points[n, 1] - centre[1], points[n, 2] - centre[2]
+        moment[0, 0] += x * x
+        moment[1, 0] += y * x
+        moment[1, 1] += y * y
+        moment[2, 0] += z * x
+        moment[2, 1] += z * y
+        moment[2, 2] += z * z
+    moment[0, 1], moment[0, 2], moment[1, 2] = moment[1, 0], moment[2, 0], moment[2, 1]
+    return moment / len(points)
+
+
+@numba.njit(cache=True, nogil=True)
+def _squared_distances(points: Any, centre: Any, cov: Any) -> Any:
+    """Squares of the Mahalanobis distances of points from a centre, shape (n,)."""
+    lower = np.empty((3, 3))
+    cholesky(cov, lower)
+    xx, yx, yy, zx, zy, zz = lower[0, 0], lower[1, 0], lower[1, 1], lower[2, 0], lower[2, 1], lower[2, 2]
+    squares = np.empty(len(points))
+    for n in range(len(points)):
+        x = (points[n, 0] - centre[0]) / xx
+        y = (points[n, 1] - centre[1] - yx * x) / yy
+        z = (points[n, 2] - centre[2] - zx * x - zy * y) / zz
+        squares[n] = x * x + y * y + z * z
+    return squares
+
+
+@numba.njit(cache=True, nogil=True)
 def _spread(
     weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any, normal_points: Any, places: Any
 ) -> Any:
     """Fill ``places`` and tell how many there are."""
-    nx, ny, nz = free.shape
     lower = np.zeros((3, 3))
-    place = np.empty(3)
-    voxel = np.empty(3, np.int64)
+    x0, y0, z0 = origin
     total = len(normal_points)
     count = 0
     drawn = 0
@@ -176,15 +203,12 @@ def _spread(
         if not cholesky(cov[h], lower):
             continue
         while drawn < total and (last or (drawn + 0.5) / total <= reached):
-            for i in range(3):
-                place[i] = mean[h, i]
-                for j in range(i + 1):
-                    place[i] += lower[i, j] * normal_points[drawn, j]
-                voxel[i] = int(np.floor((place[i] - origin[i]) / voxel_size))
+            p, q, r = normal_points[drawn, 0], normal_points[drawn, 1], normal_points[drawn, 2]
             drawn += 1
-            if not (0 <= voxel[0] < nx and 0 <= voxel[1] < ny and 0 <= voxel[2] < nz):
-                continue
-            if free[voxel[0], voxel[1], voxel[2]]:
-                places[count] = place
+            x = mean[h, 0] + lower[0, 0] * p
+            y = mean[h, 1] + lower[1, 0] * p + lower[1, 1] * q
+            z = mean[h, 2] + lower[2, 0] * p + lower[2, 1] * q + lower[2, 2] * r
+            if is_free(free, (x - x0) / voxel_size, (y - y0) / voxel_size, (z - z0) / voxel_size):
+                places[count, 0], places[count, 1], places[count, 2] = x, y, z
                 count += 1
     return count

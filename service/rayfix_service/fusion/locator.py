@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.beam import Hypotheses, multiply
 from rayfix_service.fusion.credible import CredibleRegions, posterior_points
-from rayfix_service.fusion.factor_kernels import ALL_GOOD, ALL_OUTLIER
+from rayfix_service.fusion.factor_kernels import ALL_OUTLIER
 from rayfix_service.fusion.factors import Factor, make_factor
 from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.modes import cut_to_free_space, find_modes, unit_points
 from rayfix_service.fusion.normal import normal_points
 from rayfix_service.fusion.observations import Observation, SortedReport, sort_report
+from rayfix_service.fusion.outliers import outlier_probabilities
 from rayfix_service.fusion.posterior import Posterior, make_posterior
 from rayfix_service.fusion.prior import Prior, even_prior, height_prior
 from rayfix_service.fusion.report import Angle, Candidate, Fix, Outcome, Range, Report, Status
@@ -72,7 +73,7 @@ class Locator:
         if hypotheses is None:
             return self._fix(report, "insufficient", (), {}, unused, 0.0, None)
         if not len(hypotheses):
-            outlier = _outlier_probabilities(observations, hypotheses.outlier, np.empty(0), 1.0)
+            outlier = outlier_probabilities(observations, hypotheses.outlier, np.empty(0), 1.0)
             return self._fix(report, "inconsistent", (), outlier, unused, hypotheses.log_lost, None)
         log_weight, mean, cov = cut_to_free_space(
             hypotheses.log_weight, hypotheses.mean, hypotheses.cov, self.table.scene.free_space, self._points
@@ -91,7 +92,7 @@ class Locator:
         )
         half_bad = (hypotheses.outlier == ALL_OUTLIER).mean(axis=1) >= 0.5
         status = self._status(candidates, lost + float(weight[half_bad].sum()))
-        outlier = _outlier_probabilities(observations, hypotheses.outlier, weight, lost)
+        outlier = outlier_probabilities(observations, hypotheses.outlier, weight, lost)
         regions = CredibleRegions(
             position=candidates[0].position,
             covariance=candidates[0].covariance,
@@ -232,30 +233,6 @@ class _Product(NamedTuple):
     unused: dict[int, str]
     prior: Prior
     hypotheses: Hypotheses | None
-
-
-def _outlier_probabilities(
-    observations: list[Observation], outlier: NDArray[np.int8], weight: NDArray[np.float64], lost: float
-) -> dict[int, float]:
-    """Posterior probability of each used measurement to be an outlier, by its place in the report.
-
-    Parameters
-    ----------
-    outlier : ndarray of int8, shape (h, n)
-        What each hypothesis takes for an outlier in each observation.
-    weight : ndarray of shape (h,)
-        Posterior probabilities of the hypotheses.
-    lost : float
-        Posterior probability that everything is an outlier.
-    """
-    bad: dict[int, NDArray[np.bool_]] = {}
-    for n, observation in enumerate(observations):
-        if observation.angle_index is not None:
-            bad[observation.angle_index] = outlier[:, n] == ALL_OUTLIER
-        for index in (*observation.timing_indices, *observation.differences):
-            # A time difference is as bad as the worse of its two times.
-            bad[index] = bad.get(index, False) | (outlier[:, n] != ALL_GOOD)
-    return {index: min(1.0, lost + float(weight[mask].sum())) for index, mask in bad.items()}
 
 
 def _log_sum(values: NDArray[np.float64]) -> float:

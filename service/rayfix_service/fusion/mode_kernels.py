@@ -1,4 +1,4 @@
-"""Compiled kernels of :mod:`rayfix_service.fusion.modes`; their NumPy twins are in ``reference.py``."""
+"""Compiled kernels of :mod:`rayfix_service.fusion.modes`; the NumPy twins of some are in ``reference.py``."""
 
 from typing import Any
 
@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from rayfix_service.fusion.kernels import cholesky, invert
+from rayfix_service.fusion.voxels import is_free, nearest_free
 
 
 @numba.njit(cache=True, nogil=True)
@@ -27,7 +28,6 @@ def cut_gaussians(mean: Any, cov: Any, points: Any, origin: Any, voxel_size: Any
     lower = np.zeros((3, 3))
     first = np.empty(3)
     second = np.empty((3, 3))
-    nx, ny, nz = free.shape
     for h in range(len(mean)):
         cholesky(cov[h], lower)
         # In voxels.
@@ -39,10 +39,7 @@ def cut_gaussians(mean: Any, cov: Any, points: Any, origin: Any, voxel_size: Any
         second[:] = 0.0
         for n in range(len(points)):
             p, q, r = points[n, 0], points[n, 1], points[n, 2]
-            x = np.floor(x0 + xx * p)
-            y = np.floor(y0 + yx * p + yy * q)
-            z = np.floor(z0 + zx * p + zy * q + zz * r)
-            if not (0 <= x < nx and 0 <= y < ny and 0 <= z < nz) or not free[int(x), int(y), int(z)]:
+            if not is_free(free, x0 + xx * p, y0 + yx * p + yy * q, z0 + zx * p + zy * q + zz * r):
                 continue
             count += 1
             for i in range(3):
@@ -67,6 +64,78 @@ def cut_gaussians(mean: Any, cov: Any, points: Any, origin: Any, voxel_size: Any
                         for m in range(j + 1):
                             inner += lower[i, k] * second[k, m] * lower[j, m]
                     cov[h, i, j] = 0.9 * inner + 0.1 * cov[h, i, j]
+
+
+@numba.njit(cache=True, nogil=True)
+def find_hills(
+    log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any, same_hill: Any, near: Any
+) -> Any:
+    """Gather Gaussians by the hills of their mixture, and sum each hill up.
+
+    Parameters
+    ----------
+    log_weight : ndarray of shape (h,)
+        Natural logarithms.
+    mean : ndarray of shape (h, 3), m
+    cov : ndarray of shape (h, 3, 3), m2
+    origin, voxel_size, free
+        As in :class:`~rayfix_tables.freespace.FreeSpace`.
+    same_hill : float
+        As in :func:`gather`.
+    near : float
+        A position in a solid moves to free space within this many standard deviations.
+
+    Returns
+    -------
+    probability, position, moment, member : ndarray
+        As in :class:`~rayfix_service.fusion.modes.Modes`.
+    """
+    count = len(log_weight)
+    log_density = np.empty(count)
+    precision, lower = np.empty((count, 3, 3)), np.empty((3, 3))
+    for h in range(count):
+        cholesky(cov[h], lower)
+        invert(lower, precision[h])
+        log_density[h] = log_weight[h] - np.log(lower[0, 0] * lower[1, 1] * lower[2, 2])
+    top, member = gather(log_density, mean, precision, same_hill)
+    weight = np.exp(log_weight)
+    probability, position = np.zeros(len(top)), np.zeros((len(top), 3))
+    for h in range(count):
+        probability[member[h]] += weight[h]
+        for i in range(3):
+            position[member[h], i] += weight[h] * mean[h, i]
+    for n in range(len(top)):
+        position[n] /= probability[n]
+        x, y, z = (position[n] - origin) / voxel_size
+        if not is_free(free, x, y, z):
+            position[n] = top[n]
+    moment = _second_moments(weight, mean, cov, member, probability, position)
+    moved = False
+    for n in range(len(top)):
+        x, y, z = (position[n] - origin) / voxel_size
+        if not is_free(free, x, y, z):
+            moved |= nearest_free(position[n], moment[n], near, origin, voxel_size, free)
+    if moved:
+        moment = _second_moments(weight, mean, cov, member, probability, position)
+    order = np.argsort(-probability, kind="mergesort")
+    rank = np.empty(len(top), np.int64)
+    rank[order] = np.arange(len(top))
+    # A sum of rounded numbers may be a little more than 1.
+    return np.minimum(probability[order], 1.0), position[order], moment[order], rank[member]
+
+
+@numba.njit(cache=True, nogil=True)
+def _second_moments(weight: Any, mean: Any, cov: Any, member: Any, total: Any, position: Any) -> Any:
+    """Second moment of each hill, shape (m, 3, 3), about its position."""
+    moment = np.zeros((len(total), 3, 3))
+    for h in range(len(weight)):
+        n = member[h]
+        share = weight[h] / total[n]
+        for i in range(3):
+            for j in range(3):
+                apart = (mean[h, i] - position[n, i]) * (mean[h, j] - position[n, j])
+                moment[n, i, j] += share * (cov[h, i, j] + apart)
+    return moment
 
 
 @numba.njit(cache=True, nogil=True)

@@ -7,10 +7,9 @@ Gaussian, and what lies in the free space gives the cut one's weight, mean and c
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.linalg import cholesky, inv, slogdet
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.mode_kernels import cut_gaussians, gather
+from rayfix_service.fusion.mode_kernels import cut_gaussians, find_hills
 from rayfix_tables.freespace import FreeSpace
 
 _LEAST_FREE_SHARE = 1e-3
@@ -55,7 +54,7 @@ def unit_points(count: int = 128) -> NDArray[np.float64]:
     third = np.sqrt(-2.0 * np.log(np.roll(uniform[:, 0], count // 4))) * np.cos(2.0 * np.pi * uniform[:, 2])
     points = np.concatenate([normal, third[:, None]], axis=1)
     points = np.concatenate([points, -points])
-    root = cholesky(np.cov(points.T, bias=True))
+    root = np.linalg.cholesky(np.cov(points.T, bias=True))
     return np.ascontiguousarray(np.linalg.solve(root, points.T).T)
 
 
@@ -88,49 +87,6 @@ def find_modes(
     log_weight : ndarray of shape (h,)
         Natural logarithms; the weights sum to 1.
     """
-    precision = inv(cov)
-    top, member = gather(log_weight + 0.5 * slogdet(precision)[1], mean, precision, _SAME_HILL)
-    belongs = np.exp(log_weight) * (member == np.arange(len(top))[:, None])
-    total = belongs.sum(axis=1)
-    share = belongs / total[:, None]
-    probability = np.minimum(total, 1.0)  # a sum of rounded numbers may be a little more
-    position = share @ mean
-    in_solid = ~free_space.contains(position)
-    position[in_solid] = top[in_solid]
-    moment = _second_moments(share, mean - position[member], cov)
-    in_solid = ~free_space.contains(position)
-    if in_solid.any():
-        for n in np.flatnonzero(in_solid):
-            position[n] = _nearest_free(position[n], moment[n], free_space)
-        moment = _second_moments(share, mean - position[member], cov)
-    order = np.argsort(-probability, kind="stable")
-    rank = np.empty(len(top), np.int64)
-    rank[order] = np.arange(len(top))
-    return Modes(probability=probability[order], position=position[order], cov=moment[order], member=rank[member])
-
-
-def _second_moments(
-    share: NDArray[np.float64], apart: NDArray[np.float64], cov: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Second moment of each hill, shape (m, 3, 3), from its hypotheses' shares, shape (m, h), and distances from it."""
-    about = cov + apart[:, :, None] * apart[:, None, :]
-    return (share @ about.reshape(-1, 9)).reshape(-1, 3, 3)
-
-
-def _nearest_free(
-    position: NDArray[np.float64], cov: NDArray[np.float64], free_space: FreeSpace
-) -> NDArray[np.float64]:
-    """Nearest place in the free space, the position itself where none is near."""
-    size = free_space.voxel_size
-    reach = _NEAR * np.sqrt(np.diag(cov)) + size
-    low = np.floor((position - reach - free_space.origin) / size).astype(np.int64)
-    high = np.floor((position + reach - free_space.origin) / size).astype(np.int64) + 1
-    low, high = np.clip(low, 0, free_space.free.shape), np.clip(high, 0, free_space.free.shape)
-    block = free_space.free[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
-    corners = free_space.origin + size * (low + np.argwhere(block))
-    if not len(corners):
-        return position
-    # Just inside the voxels: their faces may be another's.
-    places = np.clip(position, corners + 1e-6 * size, corners + (1.0 - 1e-6) * size)
-    apart = places - position
-    return np.asarray(places[np.argmin(np.einsum("ni,ij,nj->n", apart, inv(cov), apart))])
+    space = free_space.origin, free_space.voxel_size, free_space.free
+    probability, position, moment, member = find_hills(log_weight, mean, cov, *space, _SAME_HILL, _NEAR)
+    return Modes(probability=probability, position=position, cov=moment, member=member)
