@@ -1,10 +1,11 @@
 """The Python interface: build a table, locate reports. Everything here needs an extra."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from rayfix.extras import needs_extra
+from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
 
 with needs_extra("service"):
@@ -86,6 +87,26 @@ class Locator(_Locator):
             When the report cannot be used; its ``path`` names the field.
         """
         return super().locate(report if isinstance(report, Report) else parse_report(report))
+
+    def locate_batch(
+        self, reports: Sequence[Report | Mapping[str, Any]], *, threads: int | None = None
+    ) -> list[Fix | ReportError]:
+        """Fuse the measurements of many reports, several at a time.
+
+        Parameters
+        ----------
+        reports : sequence of Report or mapping
+            Mappings have the form of the JSON that ``POST /v1/positions`` takes.
+        threads : int, optional
+            As many as there are processor cores when left out.
+
+        Returns
+        -------
+        list of Fix or ReportError
+            Of each report in turn what :meth:`locate` returns or raises.
+        """
+        # It calls :meth:`locate`, which takes either.
+        return super().locate_batch(cast("Sequence[Report]", reports), threads=threads)
 
     def posterior(self, report: Report | Mapping[str, Any]) -> Posterior:
         """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.

@@ -13,6 +13,7 @@ import rayfix
 from rayfix.example.drop import example_paths, report_text, simulate_example_report
 from rayfix.example.files import example_report
 from rayfix.example.hall import hall_scene
+from rayfix_service.wire import parse_report
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -55,9 +56,16 @@ def test_a_locator_takes_a_dict_or_a_report(hall_table_path: Path) -> None:
     from_dict = locator.locate(document)
     assert from_dict.position is not None
     assert from_dict.target_id == "agv-7"
-    document["measurements"][0]["azimuth_deg"] = 720.0
+    wrong = json.loads(example_report())
+    wrong["measurements"][0]["azimuth_deg"] = 720.0
+    one, error, two = locator.locate_batch([document, wrong, parse_report(document)])
+    for fix in (one, two):
+        assert isinstance(fix, rayfix.Fix)
+        assert fix.log_evidence == from_dict.log_evidence
+    assert isinstance(error, rayfix.RayfixError)
+    assert "720" in str(error)
     with pytest.raises(rayfix.RayfixError, match="720"):
-        locator.locate(document)
+        locator.locate(wrong)
 
 
 def test_build_writes_beside_the_site_file(hall_site_path: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ Gaussian, and what lies in the free space gives the cut one's weight, mean and c
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,7 @@ class Modes:
     member: NDArray[np.int64]
 
 
+@cache
 def unit_points(count: int = 128) -> NDArray[np.float64]:
     """Points that stand for a standard normal in three dimensions, shape (count, 3): mean 0, covariance 1 exactly."""
     # An additive recurrence in three dimensions on the generalised golden ratio, mapped to the sphere and the radius.
@@ -55,7 +57,9 @@ def unit_points(count: int = 128) -> NDArray[np.float64]:
     points = np.concatenate([normal, third[:, None]], axis=1)
     points = np.concatenate([points, -points])
     root = np.linalg.cholesky(np.cov(points.T, bias=True))
-    return np.ascontiguousarray(np.linalg.solve(root, points.T).T)
+    unit = np.ascontiguousarray(np.linalg.solve(root, points.T).T)
+    unit.flags.writeable = False
+    return unit
 
 
 def cut_to_free_space(
