@@ -51,7 +51,7 @@ def test_a_real_server_answers_and_ends(hall_table_path: Path, start_server: Sta
             with socket.create_connection(("127.0.0.1", server.port)) as connection:
                 connection.sendall("\r\n".join([*head, f"Content-Length: {length}", "", body]).encode())
                 time.sleep(0.2)
-        server.wait_for("batch given up after")
+        server.wait_for("/v1/positions/batch given up: the client left")
         with pytest.raises(ServiceError, match=f"port {server.port}.*give another"):
             serve(hall_table_path, port=server.port)
         log = server.stop()

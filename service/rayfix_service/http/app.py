@@ -142,6 +142,7 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
         )
     install_problems(app)
     app.add_middleware(RequestContext, metrics=app.state.metrics)  # around all, to see the last resort's answers too
+    app.include_router(routes_positions.single_router)
     app.include_router(routes_positions.router)
     app.include_router(routes_formats.router)
     app.include_router(routes_stream.router)

@@ -69,7 +69,9 @@ def body_reader(limit_of: Callable[[BodyLimits], int], *, text: bool = False) ->
     return read_body
 
 
-ReportBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.report))]
+read_report_body = body_reader(lambda limits: limits.report)
+
+ReportBody = Annotated[bytes, Depends(read_report_body)]
 BatchBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.batch))]
 LinesBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.report, text=True))]
 

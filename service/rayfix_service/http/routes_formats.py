@@ -1,11 +1,9 @@
 """Routes that locate from messages of other systems; docs/formats.md describes them."""
 
-import asyncio
 from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
-from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
 from rayfix_service.adapters.adapted import known_height, station_map, with_height
@@ -16,6 +14,7 @@ from rayfix_service.adapters.ublox import parse_ublox
 from rayfix_service.http.access import client_of
 from rayfix_service.http.dependencies import LinesBody, ReportBody
 from rayfix_service.http.examples import NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
+from rayfix_service.http.json_answer import JsonAnswer
 from rayfix_service.http.locating import AnswererDep, foreign
 from rayfix_service.http.outputs import (
     ADAPTED_ANSWER,
@@ -24,7 +23,8 @@ from rayfix_service.http.outputs import (
     Output,
     request_body,
 )
-from rayfix_service.http.problems import CONNECTION_ENDED, MALFORMED_JSON, Problem, ProblemError
+from rayfix_service.http.patience import Patience
+from rayfix_service.http.problems import MALFORMED_JSON, Problem
 
 router = APIRouter(prefix="/v1/positions", tags=["formats"])
 
@@ -44,9 +44,9 @@ class LinesResult(BaseModel):
     responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(NrppaDocument, NRPPA_EXAMPLES),
 )
-async def post_nrppa(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JSONResponse:
+async def post_nrppa(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    return JSONResponse(await answerer.answer(foreign(parse_nrppa(body)), output))
+    return JsonAnswer(await answerer.answer(foreign(parse_nrppa(body)), output))
 
 
 @router.post(
@@ -56,9 +56,9 @@ async def post_nrppa(answerer: AnswererDep, body: ReportBody, output: Output = "
     responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(SilabsDocument, SILABS_EXAMPLES),
 )
-async def post_silabs(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JSONResponse:
+async def post_silabs(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    return JSONResponse(await answerer.answer(foreign(parse_silabs(body)), output))
+    return JsonAnswer(await answerer.answer(foreign(parse_silabs(body)), output))
 
 
 @router.post(
@@ -81,15 +81,14 @@ async def post_ublox(
     station: Annotated[list[str], Query(description="ANCHOR=STATION, for anchors whose id is no station's")] = [],  # noqa: B006
     height_m: Annotated[float | None, Query(description="known height of the tags, z in the scene frame, m")] = None,
     height_stdev_m: Annotated[float | None, Query(description="its standard deviation, m")] = None,
-) -> JSONResponse:
+) -> JsonAnswer:
     """Take ``+UUDF`` lines of u-blox anchors and join them by tag and sequence number."""
     known, results = known_height(height_m, height_stdev_m), []
     messages = parse_ublox(body, stations=station_map(station))
     if (limit := request.app.state.rate_limit) is not None:
         limit.charge(client_of(request), len(messages) - 1)  # one was charged for the request
+    patience = Patience(request)
     for adapted in messages:
-        if await request.is_disconnected():
-            raise ProblemError(CONNECTION_ENDED, "the connection ended before the answer")
+        await patience.take_a_breath()
         results.append(await answerer.answer_or_problem(partial(foreign, with_height(adapted, known)), output))
-        await asyncio.sleep(0)
-    return JSONResponse({"results": results})
+    return JsonAnswer({"results": results})

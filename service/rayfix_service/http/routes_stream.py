@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, WebSocket
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
+from pydantic_core import to_json
 from starlette.websockets import WebSocketDisconnect
 
 from rayfix_service.http.access import client_of
@@ -129,7 +130,7 @@ async def stream(websocket: WebSocket, answerer: AnswererDep, output: Output = "
                 )
             else:
                 answer = await answerer.answer_or_problem(partial(native, body), output)
-            await websocket.send_text(json.dumps(answer, separators=(",", ":"), allow_nan=False))
+            await websocket.send_text(to_json(answer, inf_nan_mode="null").decode())
             await asyncio.sleep(0)  # whatever else is on the loop comes in between
     except WebSocketDisconnect:
         pass

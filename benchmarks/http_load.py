@@ -1,0 +1,180 @@
+"""Requests per second of the service, beside a plain FastAPI endpoint that computes nothing, and its memory.
+
+    python benchmarks/http_load.py hall.h5 [--workers 1 2] [--seconds 5] [--rounds 3] [--memory 200000]
+
+The load comes from `wrk` (Debian package wrk) over 16 connections on loopback. Both servers are uvicorn with the same
+settings; the plain one validates the same report with the same models and answers with the example of a fix. They take
+turns, and the medians of the rounds are compared, since other work on the machine slows both.
+"""
+
+import argparse
+import json
+import re
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+from fastapi import FastAPI
+from fastapi.responses import JSONResponse
+
+from rayfix_service.http.examples import FIX_EXAMPLE, REPORT_EXAMPLES
+from rayfix_service.wire import ReportDocument
+
+REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]
+CONNECTIONS = 16
+
+plain = FastAPI()
+
+
+@plain.post("/v1/positions")
+async def post_position(report: ReportDocument) -> JSONResponse:
+    """Take a report and compute nothing."""
+    return JSONResponse(FIX_EXAMPLE)
+
+
+@plain.get("/readyz")
+async def readyz() -> dict[str, str]:
+    """Answer as the service does."""
+    return {"status": "ready"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """What one run of the load generator saw."""
+
+    per_second: float
+    median_ms: float
+    p99_ms: float
+    failed: int
+
+
+@contextmanager
+def server(command: list[str]) -> Iterator[tuple[str, int]]:
+    """Run a server on a free port; gives its URL and its process."""
+    with tempfile.TemporaryFile("w+") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log)
+        try:
+            deadline = time.monotonic() + 120
+            port = None
+            while port is None:
+                assert process.poll() is None, "the server ended"
+                assert time.monotonic() < deadline, "the server does not listen"
+                time.sleep(0.05)
+                log.seek(0)
+                port = next(iter(re.findall(r"http://127\.0\.0\.1:(\d+)", log.read())), None)
+            url = f"http://127.0.0.1:{port}"
+            _wait_until_ready(url, deadline)
+            yield url, process.pid
+        finally:
+            process.terminate()
+            process.wait(30)
+
+
+def _wait_until_ready(url: str, deadline: float) -> None:
+    answers = 0
+    while answers < 20:  # several workers take turns, more or less
+        try:
+            answers = answers + 1 if httpx.get(f"{url}/readyz", trust_env=False).status_code == 200 else 0
+        except httpx.TransportError:
+            answers = 0
+        assert time.monotonic() < deadline, "not ready"
+        time.sleep(0.02)
+
+
+def rayfix_command(table: Path, workers: int) -> list[str]:
+    """Command that serves the table."""
+    return [sys.executable, "-m", "rayfix", "serve", str(table), "--port", "0", "--workers", str(workers)]
+
+
+def plain_command(workers: int) -> list[str]:
+    """Command that serves the endpoint that computes nothing."""
+    options = ["--port", "0", "--workers", str(workers), "--no-access-log", "--app-dir", str(Path(__file__).parent)]
+    return [sys.executable, "-m", "uvicorn", f"{Path(__file__).stem}:plain", *options]
+
+
+def load(url: str, path: str, document: Any, *, seconds: float, connections: int = CONNECTIONS) -> Load:
+    """Post a document over and over."""
+    script = f"""
+wrk.method = "POST"
+wrk.headers["Content-Type"] = "application/json"
+wrk.body = {json.dumps(json.dumps(document))}
+done = function(summary, latency)
+  local e = summary.errors
+  io.write(string.format("RESULT %d %f %f %f %d\\n", summary.requests, summary.duration / 1e6,
+    latency:percentile(50) / 1e3, latency:percentile(99) / 1e3, e.connect + e.read + e.write + e.status + e.timeout))
+end
+"""
+    with tempfile.NamedTemporaryFile("w", suffix=".lua") as file:
+        file.write(script)
+        file.flush()
+        command = ["wrk", "-t1", f"-c{connections}", f"-d{seconds:g}s", "--timeout", "30s", "-s", file.name, url + path]
+        output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    (values,) = re.findall(r"^RESULT (.*)$", output, flags=re.MULTILINE)
+    requests, duration, median, p99, failed = (float(value) for value in values.split())
+    return Load(per_second=requests / duration, median_ms=median, p99_ms=p99, failed=int(failed))
+
+
+def compare(table: Path, workers: int, seconds: float, rounds: int) -> None:
+    """Load both servers in turns and print the medians."""
+    runs: dict[str, list[Load]] = {"plain FastAPI": [], "rayfix": []}
+    batches = []
+    batch = {"reports": [REPORT] * 100}
+    with server(plain_command(workers)) as (plain_url, _), server(rayfix_command(table, workers)) as (url, _):
+        for _ in range(rounds):
+            for name, each in zip(runs, (plain_url, url), strict=True):
+                runs[name].append(load(each, "/v1/positions", REPORT, seconds=seconds))
+            batches.append(load(url, "/v1/positions/batch", batch, seconds=seconds, connections=2 * workers))
+    median = {name: statistics.median(run.per_second for run in each) for name, each in runs.items()}
+    for name, each in runs.items():
+        print(
+            f"{workers} workers  {name:14} {median[name]:8.0f} requests/s   "
+            f"median {statistics.median(run.median_ms for run in each):6.2f} ms   "
+            f"p99 {statistics.median(run.p99_ms for run in each):6.2f} ms   failed {sum(run.failed for run in each)}"
+        )
+    ratios = [b.per_second / a.per_second for a, b in zip(*runs.values(), strict=True)]
+    print(f"{workers} workers  share of plain FastAPI's: {100 * statistics.median(ratios):.0f} %")
+    fixes = 100 * statistics.median(run.per_second for run in batches)
+    print(f"{workers} workers  batches of 100: {fixes:.0f} fixes/s   failed {sum(run.failed for run in batches)}")
+
+
+def memory(table: Path, requests: int) -> None:
+    """Print the resident memory of one process after each tenth of the requests."""
+    with server(rayfix_command(table, 1)) as (url, pid):
+        done = 0.0
+        while done < requests:
+            begin = time.monotonic()
+            run = load(url, "/v1/positions", REPORT, seconds=10)
+            done += run.per_second * (time.monotonic() - begin)
+            resident = re.findall(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())[0]
+            print(f"{done:9.0f} requests   {int(resident) / 1024:7.1f} MiB   failed {run.failed}", flush=True)
+
+
+def main() -> None:
+    """Measure."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("table", type=Path)
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--seconds", type=float, default=5.0, help="of each run (default: 5)")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--memory", type=int, metavar="REQUESTS", help="watch the memory over so many instead")
+    options = parser.parse_args()
+    if shutil.which("wrk") is None:
+        sys.exit("wrk is missing; install the Debian package wrk")
+    if options.memory:
+        memory(options.table, options.memory)
+        return
+    for workers in options.workers:
+        compare(options.table, workers, options.seconds, options.rounds)
+
+
+if __name__ == "__main__":
+    main()
