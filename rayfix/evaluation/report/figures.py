@@ -18,6 +18,7 @@ from rayfix.evaluation.report.charts import (
 )
 from rayfix.evaluation.report.geometry import Backdrop, backdrop
 from rayfix.evaluation.report.interactive import space_figure
+from rayfix.evaluation.report.maps import planning_chart
 from rayfix.evaluation.report.spaces import plane_picture, space_picture
 from rayfix.evaluation.report.style import styled, write_figure
 from rayfix.evaluation.report.words import (
@@ -25,6 +26,7 @@ from rayfix.evaluation.report.words import (
     length,
     paths_caption,
     points_caption,
+    share,
     stress_caption,
 )
 from rayfix.evaluation.studies.evaluate import Evaluation
@@ -69,6 +71,7 @@ def figure_specs(evaluation: Evaluation) -> tuple[Spec, ...]:
         *_space_specs(evaluation, scene),
         *_cdf_specs(evaluation.results),
         *_method_specs(evaluation.results),
+        _planning_spec(evaluation.results, scene),
         *(_stress_spec(study) for study in evaluation.results["studies"] if study["key"].startswith("stress-")),
     ]
     return tuple(specs)
@@ -230,6 +233,23 @@ def _method_specs(results: Document) -> list[Spec]:
             draw=lambda: calibration_chart([(label, c, n) for label, c, n in curves if c]),
         ),
     ]
+
+
+def _planning_spec(results: Document, scene: Backdrop) -> Spec:
+    planning = results["planning"]
+    figures = "; ".join(
+        f"{plan['label']}: {share(plan['coverage'])} of fixes within {plan['threshold_m']:g} m, error to expect "
+        f"{length(plan['expected_error_m']['50'])} in half of the squares"
+        for plan in planning["maps"]
+    )
+    return Spec(
+        key="planning",
+        title="Planning maps",
+        caption=f"What the table alone foretells of transmitters at z = {planning['height_m']:g} m, for "
+        f"squares of {planning['spacing_m']:g} m; triangles are stations, lines what the plane cuts. {figures}. "
+        "'rayfix plan' draws such maps for other heights and noise, and beside those of a station added or moved.",
+        draw=lambda: planning_chart(scene, planning),
+    )
 
 
 def _stress_spec(study: Document) -> Spec:

@@ -24,6 +24,7 @@ _SECTIONS = (
     ("noise", "Accuracy by noise"),
     ("methods", "Methods side by side"),
     ("calibration", "Stated and true uncertainty"),
+    ("planning", "Over the floor"),
     ("stress", "When things are wrong"),
     ("made", "How this was made"),
 )
@@ -64,6 +65,7 @@ def render_page(
         "noise": _noise(results, by_key),
         "methods": _methods(evaluation, by_key),
         "calibration": _calibration(results) + by_key["calibration"],
+        "planning": _planning(by_key),
         "stress": _stress(by_key, specs),
         "made": _made(results, command),
     }
@@ -250,6 +252,15 @@ def _calibration(results: Document) -> str:
     return (
         '<div class="scroll"><table><caption>Share of true positions within the credible ellipsoid of each stated '
         f"probability.</caption><thead><tr><th></th>{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def _planning(by_key: Mapping[str, str]) -> str:
+    return (
+        "<p>Everything above is of drops anywhere. Where fixes will be good and where not is foretold without a "
+        "forward "
+        "solver: the table says what each station would hear of a place, and the same table locates it.</p>"
+        + by_key["planning"]
     )
 
 

@@ -27,7 +27,7 @@ class Effort:
     coarse : bool
         Whether tables of other path priors have wide windows only.
     map_spacing : float, m
-        Of the map of fingerprints.
+        Of the map of fingerprints and of planning maps.
     """
 
     name: str

@@ -17,6 +17,7 @@ from rayfix.evaluation.studies.cases import Case, World, document_key
 from rayfix.evaluation.studies.catalogue import Effort, Study, studies
 from rayfix.evaluation.studies.methods import METHODS
 from rayfix.evaluation.studies.pictures import draw_pictures
+from rayfix.evaluation.studies.planning import plan_site
 from rayfix.evaluation.studies.pool import Task, run_tasks
 from rayfix.evaluation.studies.statements import check_statements
 from rayfix.evaluation.studies.store import Store, code_digest
@@ -134,6 +135,9 @@ def evaluate_site(
         "studies": [runner.study_document(study, drops["heard"]) for study in planned],
         "statements": [s.document() for s in check_statements(runner.runs(planned, drops["heard"]), seed)],
         "length_differences": pictures["length_differences"],
+        "planning": runner.stored(
+            "planning", {"spacing": effort.map_spacing}, lambda: plan_site(table, spacing=effort.map_spacing, seed=seed)
+        ),
     }
     timings = {
         "cores": os.cpu_count(),
