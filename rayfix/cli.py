@@ -7,11 +7,14 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from rayfix.extras import needs_extra
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.version import software_version
+
+if TYPE_CHECKING:
+    from rayfix_service.adapters.omlox_hub import HubSettings
 
 
 class _Parser(argparse.ArgumentParser):
@@ -169,6 +172,8 @@ def _parser() -> argparse.ArgumentParser:
         "--window", type=float, default=0.5, help="seconds that a packet waits for more locators (default: 0.5)"
     )
     mqtt.add_argument("--frame", choices=("lcs", "scene", "north"), default="lcs", help="of the angles (default: lcs)")
+    mqtt.add_argument("--track", action="store_true", help="follow tags from packet to packet")
+    _add_hub_argument(mqtt)
     mqtt.add_argument("--tls", action="store_true", help="encrypt; the port is then 8883 unless given")
     mqtt.add_argument("--username", help=f"the password is taken from the environment variable {_PASSWORD_VARIABLE}")
     return parser
@@ -176,7 +181,25 @@ def _parser() -> argparse.ArgumentParser:
 
 _INPUTS = ("native", "nrppa", "silabs", "ublox")
 _OUTPUTS = ("native", "3gpp", "omlox")
+_HUB_VARIABLE = "RAYFIX_OMLOX_TOKEN"
 _PASSWORD_VARIABLE = "RAYFIX_MQTT_PASSWORD"  # not an argument, which other users of the machine could read
+
+
+def _add_hub_argument(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--omlox-hub",
+        metavar="URL",
+        help="also tell this omlox hub of all positions, e.g. http://hub:8081/v2; "
+        f"a token is taken from the environment variable {_HUB_VARIABLE}",
+    )
+
+
+def _hub_settings(options: argparse.Namespace) -> "HubSettings | None":
+    from rayfix_service.adapters.omlox_hub import HubSettings
+
+    if options.omlox_hub is None:
+        return None
+    return HubSettings(url=options.omlox_hub, token=os.environ.get(_HUB_VARIABLE))
 
 
 def _add_output_arguments(command: argparse.ArgumentParser) -> None:
@@ -421,6 +444,8 @@ def _mqtt(options: argparse.Namespace) -> int:
         stations=station_map(options.station),
         frame=options.frame,
         height=known_height(*(options.height or (None, None))),
+        track=options.track,
+        hub=_hub_settings(options),
     )
     serve_mqtt(options.table, broker, settings)
     return 0

@@ -54,6 +54,8 @@ class TrackAnswer:
     covariance_m2: Matrix
     velocity_m_s: Point
     velocity_covariance_m2_s2: Matrix
+    horizontal_accuracy_m: float
+    vertical_accuracy_m: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,6 +193,8 @@ def _track(document: Mapping[str, Any]) -> TrackAnswer:
         covariance_m2=_matrix(document["covariance_m2"]),
         velocity_m_s=_point(document["velocity_m_s"]),
         velocity_covariance_m2_s2=_matrix(document["velocity_covariance_m2_s2"]),
+        horizontal_accuracy_m=float(document["horizontal_accuracy_m"]),
+        vertical_accuracy_m=float(document["vertical_accuracy_m"]),
     )
 
 

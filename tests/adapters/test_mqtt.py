@@ -21,6 +21,7 @@ import pytest
 from rayfix.cli import main
 from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.mqtt import Broker, BrokerError, MqttSettings, check_settings, parse_broker, run_mqtt
+from rayfix_service.adapters.omlox_hub import HubSettings
 from rayfix_service.adapters.silabs import parse_silabs
 from rayfix_service.adapters.silabs_stream import SilabsStream
 from rayfix_service.fusion.locator import Locator
@@ -164,6 +165,41 @@ def test_a_packet_becomes_a_position(mosquitto: Mosquitto, locator: Locator):
     assert document["target_id"] == TAG
     assert {outcome["source"] for outcome in document["measurements"]} == {"bs1", "bs2", "bs3"}
     assert document["timestamp"].endswith("Z")
+
+
+def test_tags_are_followed_and_a_hub_is_told(mosquitto: Mosquitto, locator: Locator):
+    mosquitto.start()
+    told: list[tuple[str, dict[str, Any]]] = []
+
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        head = (await reader.readuntil(b"\r\n\r\n")).decode()
+        (length,) = (int(line.split(":")[1]) for line in head.splitlines() if line.lower().startswith("content-length"))
+        told.append((head.splitlines()[0], json.loads(await reader.readexactly(length))))
+        writer.write(b"HTTP/1.1 204 No Content\r\nconnection: close\r\n\r\n")
+        await writer.drain()
+        writer.close()
+
+    async def scenario() -> list[tuple[str, dict[str, Any]]]:
+        async with await asyncio.start_server(answer, "127.0.0.1", 0) as server:
+            url = f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/v2"
+            settings = replace(SETTINGS, window=0.1, track=True, hub=HubSettings(url=url))
+            async with locating(locator, mosquitto.address, settings):
+                answers = []
+                for sequence in (1, 2, 3):
+                    answers += await exchange(mosquitto.address, angles(sequence), answers=1)
+            # The end of the session waits for what is on its way.
+            return answers
+
+    answers = run(scenario)
+    tracks = [document["track"] for _, document in answers]
+    assert [(track["state"], track["num_reports"]) for track in tracks] == [
+        ("started", 1),
+        ("updated", 2),
+        ("updated", 3),
+    ]
+    assert [line for line, _ in told] == [f"PUT /v2/providers/{TAG}/location HTTP/1.1"] * 3
+    for (_, location), track in zip(told, tracks, strict=True):
+        assert location["position"]["coordinates"] == list(track["position"].values())
 
 
 def test_packets_are_joined_by_sequence_and_published_in_the_format_asked_for(mosquitto: Mosquitto, locator: Locator):

@@ -22,6 +22,8 @@ from rayfix_service.fusion.report import Candidate, Fix, Outcome
 from rayfix_service.http.examples import LOCAL_3D_EXAMPLE, OMLOX_EXAMPLE
 from rayfix_service.http.outputs import Local3dPointUncertaintyEllipsoid, OmloxLocation
 from rayfix_service.moments import utc_milliseconds
+from rayfix_service.tracking.estimate import Estimate
+from rayfix_service.tracking.tracker import TrackedPosition
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo
 
@@ -173,12 +175,66 @@ def test_without_position_there_is_nothing_to_write(output: Any):
     assert write(fix, "native", SITE, compute_seconds=0.0)["position"] is None
 
 
+def a_track(timestamp: str = "2026-01-31T10:00:01Z") -> TrackedPosition:
+    """Make a track at (3, 4, 1) m that moves by 0.6 m/s along -x and 0.8 m/s along +y."""
+    covariance = np.diag([0.04, 0.09, 0.01])
+    position = np.array([3.0, 4.0, 1.0])
+    found = Estimate(
+        probability=0.9,
+        position=position,
+        covariance=covariance,
+        velocity=np.array([-0.6, 0.8, 0.0]),
+        velocity_covariance=0.1 * np.eye(3),
+    )
+    points = position + normal_points(1024) @ np.sqrt(covariance)
+    regions = CredibleRegions(position=position, covariance=covariance, points=points, share=1.0)
+    return TrackedPosition(state="updated", timestamp=timestamp, num_reports=7, estimate=found, regions=regions)
+
+
+@pytest.mark.parametrize(
+    # A target that moves to 126.87 deg, counter-clockwise from +x.
+    ("north_deg", "course"),
+    [(90.0, 323.1301), (126.8699, 0.0), (0.0, 233.1301), (-90.0, 143.1301)],
+)
+def test_a_track_takes_the_fixs_place(north_deg: float, course: float):
+    fix = a_fix(np.eye(3), target_id="t", timestamp="2026-01-31T10:00:00Z")
+    location = fix_to_omlox(fix, site(north_deg), a_track())
+    assert location["position"]["coordinates"] == [3.0, 4.0, 1.0]
+    assert location["timestamp_generated"] == "2026-01-31T10:00:01.000Z"
+    assert location["speed"] == pytest.approx(1.0)
+    assert (location["course"] - course + 180.0) % 360.0 == pytest.approx(180.0, abs=1e-3)
+    assert location["properties"]["rayfix.track"] == "updated"
+    # 68 % of a Gaussian of 0.2 m by 0.3 m.
+    assert location["accuracy"] == pytest.approx(0.384, abs=0.01)
+    assert fix_to_3gpp(fix, site(north_deg), a_track())["point"] == {"x": 3.0, "y": 4.0, "z": 1.0}
+
+
+def test_a_track_stands_beside_the_native_fix():
+    fix = a_fix(np.eye(3), target_id="t", timestamp="2026-01-31T10:00:00Z")
+    alone = write(fix, "native", SITE, compute_seconds=0.0)
+    beside = write(fix, "native", SITE, compute_seconds=0.0, track=a_track())
+    assert "track" not in alone
+    track = beside.pop("track")
+    assert beside == alone
+    assert track["velocity_m_s"] == {"x": -0.6, "y": 0.8, "z": 0.0}
+    assert (track["state"], track["num_reports"], track["probability"]) == ("updated", 7, 0.9)
+    assert track["position"] == {"x": 3.0, "y": 4.0, "z": 1.0}
+    assert track["vertical_accuracy_m"] == pytest.approx(0.0994, abs=0.004)  # 68 % of a Gaussian of 0.1 m
+
+
+def test_without_a_fix_a_track_still_tells_a_position():
+    fix = Fix(status="insufficient", candidates=(), outcomes=(), log_evidence=0.0, table_id="id", target_id="t")
+    assert fix_to_omlox(fix, SITE, a_track())["position"]["coordinates"] == [3.0, 4.0, 1.0]
+
+
 def test_the_documents_describe_what_comes():
     fix = a_fix(np.eye(3), target_id="t", timestamp="2026-01-31T11:00:00Z")
     for model, written, example in (
         (Local3dPointUncertaintyEllipsoid, fix_to_3gpp(fix, SITE), LOCAL_3D_EXAMPLE),
         (OmloxLocation, fix_to_omlox(fix, SITE), OMLOX_EXAMPLE),
     ):
-        assert model.model_validate(written).model_dump() == written
-        assert model.model_validate(example).model_dump() == example
+        assert model.model_validate(written).model_dump(exclude_unset=True) == written
+        assert model.model_validate(example).model_dump(exclude_unset=True) == example
         assert example.keys() == written.keys()
+    tracked = fix_to_omlox(fix, SITE, a_track())
+    assert OmloxLocation.model_validate(tracked).model_dump(exclude_unset=True) == tracked

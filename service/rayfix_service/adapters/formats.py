@@ -10,6 +10,7 @@ from rayfix_service.adapters.silabs import parse_silabs
 from rayfix_service.adapters.threegpp import fix_to_3gpp
 from rayfix_service.adapters.ublox import parse_ublox
 from rayfix_service.fusion.report import Fix, Height
+from rayfix_service.tracking.tracker import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report
 from rayfix_service.wire.problems import path_text
 from rayfix_tables.site import SiteInfo
@@ -68,6 +69,7 @@ def write(
     *,
     compute_seconds: float,
     adapted: Adapted | None = None,
+    track: TrackedPosition | None = None,
 ) -> dict[str, Any]:
     """Turn a fix into JSON-compatible data.
 
@@ -82,6 +84,8 @@ def write(
     adapted : Adapted, optional
         Where the report came from, if from another format; the native answer then has the ``source`` of each
         measurement and the measurements that were ``skipped``.
+    track : TrackedPosition, optional
+        The target's track after the report: beside the fix in the native answer, instead of it in the others.
 
     Raises
     ------
@@ -90,11 +94,11 @@ def write(
     """
     match output_format:
         case "3gpp":
-            return fix_to_3gpp(fix, site)
+            return fix_to_3gpp(fix, site, track)
         case "omlox":
-            return fix_to_omlox(fix, site)
+            return fix_to_omlox(fix, site, track)
         case "native":
-            document = fix_to_document(fix, compute_seconds)
+            document = fix_to_document(fix, compute_seconds, track)
             if adapted is not None:
                 for outcome, source in zip(document["measurements"], adapted.sources, strict=True):
                     outcome["source"] = path_text(source)

@@ -14,9 +14,11 @@ import aiomqtt
 
 from rayfix_service.adapters.adapted import Adapted
 from rayfix_service.adapters.formats import OutputFormat, write
+from rayfix_service.adapters.omlox_hub import HubSettings, OmloxHub, open_hub
 from rayfix_service.adapters.silabs_stream import SilabsStream
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import Frame, Height
+from rayfix_service.tracking.tracker import Tracker
 from rayfix_tables.errors import RayfixError, ReportError
 
 _log = logging.getLogger(__name__)
@@ -60,6 +62,10 @@ class MqttSettings:
         Frame of the angles.
     height : Height or None
         What is known of the height of all tags.
+    track : bool
+        Whether tags are followed from packet to packet.
+    hub : HubSettings or None
+        Omlox hub that is told of all positions as well.
     """
 
     topic: str = "silabs/aoa/angle/+/+"
@@ -69,6 +75,8 @@ class MqttSettings:
     stations: Mapping[str, str] = field(default_factory=dict)
     frame: Frame = "lcs"
     height: Height | None = None
+    track: bool = False
+    hub: HubSettings | None = None
 
 
 def parse_broker(text: str, *, tls: bool = False, username: str | None = None, password: str | None = None) -> Broker:
@@ -134,24 +142,29 @@ async def run_mqtt(
         When a setting is out of range, or the first connection fails.
     """
     check_settings(settings)
+    site = locator.table.site
     stream = SilabsStream(
-        locator.table.site,
-        window=settings.window,
-        stations=settings.stations,
-        frame=settings.frame,
-        height=settings.height,
+        site, window=settings.window, stations=settings.stations, frame=settings.frame, height=settings.height
     )
-    place = f"{broker.host}:{broker.port}"
+    tracker = Tracker(locator.table.scene) if settings.track else None
+    async with open_hub(settings.hub) as hub:
+        session = _Session(locator=locator, settings=settings, stream=stream, tracker=tracker, hub=hub)
+        await _run_session(session, broker, on_ready)
+
+
+async def _run_session(session: "_Session", broker: Broker, on_ready: Callable[[], None] | None) -> None:
+    """Connect, and again when the connection is lost."""
+    place, topic = f"{broker.host}:{broker.port}", session.settings.topic
     connected, pause = False, 1.0
     while True:
         try:
             async with _client(broker) as client:
-                await client.subscribe(settings.topic)
+                await client.subscribe(topic)
                 connected, pause = True, 1.0
-                _log.info("reading '%s' from %s", settings.topic, place)
+                _log.info("reading '%s' from %s", topic, place)
                 if on_ready is not None:
                     on_ready()
-                await _first_of(_read(client, stream, locator, settings), _watch(client, stream, locator, settings))
+                await _first_of(session.read(client), session.watch(client))
         except (aiomqtt.MqttError, OSError) as error:
             if not connected:
                 text = f"cannot use the MQTT broker {place} ({error}); check its address and your rights"
@@ -185,38 +198,49 @@ async def _first_of(*coroutines: Coroutine[Any, Any, None]) -> None:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _read(client: aiomqtt.Client, stream: SilabsStream, locator: Locator, settings: MqttSettings) -> None:
-    async for message in client.messages:
-        if isinstance(message.payload, bytes):
-            reports = stream.receive(message.topic.value, message.payload, monotonic())
-            await _publish(client, reports, locator, settings)
+@dataclass(frozen=True, kw_only=True)
+class _Session:
+    """What answers packets: the table, and what is remembered from one to the next."""
 
+    locator: Locator
+    settings: MqttSettings
+    stream: SilabsStream
+    tracker: Tracker | None
+    hub: OmloxHub | None
 
-async def _watch(client: aiomqtt.Client, stream: SilabsStream, locator: Locator, settings: MqttSettings) -> None:
-    """End packets that not all locators have heard."""
-    while True:
-        await asyncio.sleep(0.1 * settings.window)
-        await _publish(client, stream.due(monotonic()), locator, settings)
+    async def read(self, client: aiomqtt.Client) -> None:
+        """Take all messages."""
+        async for message in client.messages:
+            if isinstance(message.payload, bytes):
+                await self._publish(client, self.stream.receive(message.topic.value, message.payload, monotonic()))
 
+    async def watch(self, client: aiomqtt.Client) -> None:
+        """End packets that not all locators have heard."""
+        while True:
+            await asyncio.sleep(0.1 * self.settings.window)
+            await self._publish(client, self.stream.due(monotonic()))
 
-async def _publish(client: aiomqtt.Client, reports: list[Adapted], locator: Locator, settings: MqttSettings) -> None:
-    for adapted in reports:
+    async def _publish(self, client: aiomqtt.Client, reports: list[Adapted]) -> None:
+        for adapted in reports:
+            try:
+                document = self._answer(adapted)
+            except ReportError as error:
+                _log.info("no position of '%s': %s", adapted.report.target_id, error)
+                continue
+            except Exception:
+                # A defect that one packet meets must not end the service.
+                _log.exception("a packet of '%s' failed", adapted.report.target_id)
+                continue
+            topic = self.settings.publish.format(target_id=adapted.report.target_id)
+            await client.publish(topic, json.dumps(document))
+
+    def _answer(self, adapted: Adapted) -> dict[str, Any]:
+        """Locate a packet, go on with its tag's track, and tell the hub."""
         begin = perf_counter()
-        try:
-            fix = locator.locate(adapted.report)
-            document = write(
-                fix,
-                settings.output,
-                locator.table.site,
-                compute_seconds=perf_counter() - begin,
-                adapted=adapted,
-            )
-        except ReportError as error:
-            _log.info("no position of '%s': %s", adapted.report.target_id, error)
-            continue
-        except Exception:
-            # A defect that one packet meets must not end the service.
-            _log.exception("a packet of '%s' failed", adapted.report.target_id)
-            continue
-        topic = settings.publish.format(target_id=adapted.report.target_id)
-        await client.publish(topic, json.dumps(document))
+        fused = self.locator.fuse(adapted.report)
+        seconds = perf_counter() - begin
+        track = self.tracker.follow(fused) if self.tracker is not None else None
+        site = self.locator.table.site
+        if self.hub is not None:
+            self.hub.tell(fused.fix, site, track)
+        return write(fused.fix, self.settings.output, site, compute_seconds=seconds, adapted=adapted, track=track)

@@ -1,28 +1,31 @@
 """A position as a location object of omlox hubs (omlox Hub API, version 2)."""
 
+import math
 from typing import Any
 
 from rayfix_service.adapters.positions import best_candidate
 from rayfix_service.fusion.report import Fix
 from rayfix_service.moments import utc_milliseconds
+from rayfix_service.tracking.tracker import TrackedPosition
 from rayfix_tables.site import SiteInfo
 
 UNKNOWN_PROVIDER = "unknown"
 """Provider id of a fix without a target, since a location must have one, and provider type of all."""
 
 
-def fix_to_omlox(fix: Fix, site: SiteInfo) -> dict[str, Any]:
+def fix_to_omlox(fix: Fix, site: SiteInfo, track: TrackedPosition | None = None) -> dict[str, Any]:
     """Describe the best candidate of a fix as an omlox Location.
 
     The position is in the scene frame, so that ``crs`` is "local" and ``source``, the site's name, should be the
-    foreign id of the hub's zone. What the format has no place for stands in ``properties``.
+    foreign id of the hub's zone. What the format has no place for stands in ``properties``. With a track, it is the
+    track's position, with ``speed`` and ``course``, the horizontal velocity and its bearing.
 
     Raises
     ------
     ReportError
         When the fix has no position.
     """
-    candidate, regions = best_candidate(fix)
+    candidate, regions = best_candidate(fix, track)
     location: dict[str, Any] = {
         "position": {"type": "Point", "coordinates": candidate.position.tolist()},
         "source": site.name,
@@ -40,6 +43,12 @@ def fix_to_omlox(fix: Fix, site: SiteInfo) -> dict[str, Any]:
             "rayfix.table_id": fix.table_id,
         },
     }
-    if fix.timestamp is not None:
-        location["timestamp_generated"] = utc_milliseconds(fix.timestamp)
+    timestamp = fix.timestamp if track is None else track.timestamp
+    if timestamp is not None:
+        location["timestamp_generated"] = utc_milliseconds(timestamp)
+    if track is not None:
+        vx, vy, _ = track.estimate.velocity.tolist()
+        location["speed"] = math.hypot(vx, vy)
+        location["course"] = math.degrees(site.north - math.atan2(vy, vx)) % 360.0
+        location["properties"]["rayfix.track"] = track.state
     return location

@@ -1,18 +1,23 @@
-"""What formats that know one position alone take from a fix."""
+"""What formats that know one position alone take from a fix, or from the track that it went into."""
 
 from rayfix_service.fusion.credible import CredibleRegions
 from rayfix_service.fusion.report import Candidate, Fix
+from rayfix_service.tracking.tracker import TrackedPosition
 from rayfix_tables.errors import ReportError
 
 
-def best_candidate(fix: Fix) -> tuple[Candidate, CredibleRegions]:
-    """Return the most probable candidate and the regions around it.
+def best_candidate(fix: Fix, track: TrackedPosition | None = None) -> tuple[Candidate, CredibleRegions]:
+    """Return the most probable candidate and the regions around it: the track's where there is one.
 
     Raises
     ------
     ReportError
-        When the fix has none.
+        When there is none.
     """
+    if track is not None:
+        found = track.estimate
+        place = Candidate(probability=found.probability, position=found.position, covariance=found.covariance)
+        return place, track.regions
     if fix.candidates and fix.regions is not None:
         return fix.candidates[0], fix.regions
     reasons = "; ".join(

@@ -7,23 +7,25 @@ import numpy as np
 
 from rayfix_service.adapters.positions import best_candidate
 from rayfix_service.fusion.report import Fix
+from rayfix_service.tracking.tracker import TrackedPosition
 from rayfix_tables.site import SiteInfo
 
 
-def fix_to_3gpp(fix: Fix, site: SiteInfo) -> dict[str, Any]:
+def fix_to_3gpp(fix: Fix, site: SiteInfo, track: TrackedPosition | None = None) -> dict[str, Any]:
     """Describe the best candidate of a fix as Local3dPointUncertaintyEllipsoid (TS 29.572, clause 6.1.6.2).
 
     ``point`` is in the scene frame, whose origin ``localOrigin`` names by the site's name;
     ``horizAxesOrientation`` is the bearing of the scene's +y axis, clockwise from north, in 0.1 deg. The semi-axes
     are those of the upright ellipsoid that holds the target with the probability ``confidence``, in percent;
     ``orientationMajor`` is the bearing of the major one, 0 to 179 deg clockwise from north (TS 23.032, clause 6.1).
+    With a track, it is the track's position.
 
     Raises
     ------
     ReportError
         When the fix has no position.
     """
-    candidate, regions = best_candidate(fix)
+    candidate, regions = best_candidate(fix, track)
     x, y, z = candidate.position.tolist()
     ellipsoid = regions.upright_ellipsoid(fix.confidence)
     (minor, major), axes = np.linalg.eigh(ellipsoid.shape[:2, :2])

@@ -96,6 +96,8 @@ class OmloxLocation(BaseModel):
     provider_type: Literal["unknown"]
     provider_id: str = Field(description="the target_id")
     timestamp_generated: str | None = None
+    speed: float | None = Field(default=None, description="horizontal speed of the track, m/s")
+    course: float | None = Field(default=None, description="bearing of the track, clockwise from north, deg")
     crs: Literal["local"]
     accuracy: float = Field(
         description="horizontal accuracy, m: the radius that holds the target with the `confidence` of the report"

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from rayfix_service.fusion.credible import CredibleRegions
 from rayfix_service.fusion.locator import Fused
 from rayfix_service.moments import utc_moment
 from rayfix_service.tracking.estimate import Estimate, estimate
@@ -37,12 +38,15 @@ class TrackedPosition:
     num_reports : int
         Reports since the track's start that said something of the position.
     estimate : Estimate
+    regions : CredibleRegions
+        Regions around the estimate's position that hold the target with any probability.
     """
 
     state: TrackState
     timestamp: str
     num_reports: int
     estimate: Estimate
+    regions: CredibleRegions
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -153,7 +157,7 @@ class Tracker:
         particles = self._newborn(fused, rng)
         if particles is None:
             return None
-        position = TrackedPosition(state=state, timestamp=timestamp, num_reports=1, estimate=estimate(particles))
+        position = _told(state, timestamp, 1, particles)
         return _Track(particles=particles, position=position, seconds=seconds, touched=now, rng=rng)
 
     def _newborn(self, fused: Fused, rng: np.random.Generator) -> Particles | None:
@@ -178,7 +182,7 @@ class Tracker:
         if particles is None:
             return None
         told = 1 if state == "restarted" else track.position.num_reports + (state == "updated")
-        position = TrackedPosition(state=state, timestamp=timestamp, num_reports=told, estimate=estimate(particles))
+        position = _told(state, timestamp, told, particles)
         return _Track(particles=particles, position=position, seconds=track.seconds + gap, touched=now, rng=rng)
 
     def _take_in(
@@ -203,3 +207,16 @@ class Tracker:
         """Posterior probability that the report begins a new track, given the log ratio of evidence for that."""
         odds = self.settings.restart_probability / (1.0 - self.settings.restart_probability)
         return 1.0 / (1.0 + math.exp(min(-log_ratio - math.log(odds), 700.0)))
+
+
+def _told(state: TrackState, timestamp: str, num_reports: int, particles: Particles) -> TrackedPosition:
+    found = estimate(particles)
+    return TrackedPosition(
+        state=state,
+        timestamp=timestamp,
+        num_reports=num_reports,
+        estimate=found,
+        regions=CredibleRegions(
+            position=found.position, covariance=found.covariance, points=particles.position, share=1.0
+        ),
+    )

@@ -11,6 +11,7 @@ from rayfix_service.wire.documents import (
     ReportDocument,
 )
 from rayfix_service.wire.fields import METRES_PER_NANOSECOND, WireModel
+from rayfix_service.wire.points import Point
 from rayfix_service.wire.problems import (
     FieldProblem,
     InvalidReportError,
@@ -19,11 +20,7 @@ from rayfix_service.wire.problems import (
     problems_of,
 )
 from rayfix_service.wire.request import parse_report, read_json
-from rayfix_service.wire.response import (
-    FixDocument,
-    Point,
-    fix_to_document,
-)
+from rayfix_service.wire.response import FixDocument, fix_to_document
 from rayfix_service.wire.writing import report_to_document
 
 __all__ = [

@@ -1,23 +1,13 @@
 """From a fix to its JSON."""
 
-from typing import Annotated, Any
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from rayfix_service.fusion.report import Fix, Status
-
-
-class Point(BaseModel):
-    """A position in the scene frame, m."""
-
-    x: float
-    y: float
-    z: float
-
-
-_Matrix = Annotated[list[Annotated[list[float], Field(min_length=3, max_length=3)]], Field(min_length=3, max_length=3)]
+from rayfix_service.tracking.tracker import TrackedPosition
+from rayfix_service.wire.points import Matrix, Point, point
+from rayfix_service.wire.track import TrackDocument, track_to_document
 
 
 class CandidateDocument(BaseModel):
@@ -27,7 +17,7 @@ class CandidateDocument(BaseModel):
 
     probability: float = Field(description="posterior probability that the target is there")
     position: Point
-    covariance_m2: _Matrix = Field(description="covariance of the position, m2, rows in the order x, y, z")
+    covariance_m2: Matrix = Field(description="covariance of the position, m2, rows in the order x, y, z")
 
 
 class OutcomeDocument(BaseModel):
@@ -52,13 +42,13 @@ class FixDocument(BaseModel):
     timestamp: str | None
     status: Status
     position: Point | None = Field(description="most probable position, null when no measurement could be used")
-    covariance_m2: _Matrix | None = Field(description="covariance of that position, m2")
+    covariance_m2: Matrix | None = Field(description="covariance of that position, m2")
     horizontal_accuracy_m: float | None = Field(
         description="radius of the horizontal circle around the position that holds the target with probability "
         "`confidence`, wherever it is: where the position is less probable, the circle reaches to its rivals"
     )
     vertical_accuracy_m: float | None = Field(description="half the height of the layer that does, likewise")
-    ellipsoid_semi_axes_m: _Matrix | None = Field(
+    ellipsoid_semi_axes_m: Matrix | None = Field(
         description="an ellipsoid around the position that does, likewise: vectors x, y, z from its centre to the ends "
         "of its axes, longest first"
     )
@@ -70,9 +60,12 @@ class FixDocument(BaseModel):
     measurements: list[OutcomeDocument]
     table_id: str
     compute_ms: float = Field(description="time the fix itself took, ms")
+    track: TrackDocument | None = Field(
+        default=None, description="the target as followed from report to report; absent unless that is asked for"
+    )
 
 
-def fix_to_document(fix: Fix, compute_seconds: float) -> dict[str, Any]:
+def fix_to_document(fix: Fix, compute_seconds: float, track: TrackedPosition | None = None) -> dict[str, Any]:
     """Turn a fix into the JSON-compatible answer, which :class:`FixDocument` describes.
 
     The answer is built as plain dicts: going through the models would take longer than the fix itself.
@@ -83,18 +76,20 @@ def fix_to_document(fix: Fix, compute_seconds: float) -> dict[str, Any]:
         The answer to one report.
     compute_seconds : float
         Time that the fix took, s.
+    track : TrackedPosition, optional
+        The target's track after the report.
     """
     candidates = [
         {
             "probability": float(candidate.probability),
-            "position": _point(candidate.position),
+            "position": point(candidate.position),
             "covariance_m2": candidate.covariance.tolist(),
         }
         for candidate in fix.candidates
     ]
     best = candidates[0] if candidates else {"position": None, "covariance_m2": None}
     regions, confidence = fix.regions, fix.confidence
-    return {
+    document = {
         "target_id": fix.target_id,
         "timestamp": fix.timestamp,
         "status": fix.status,
@@ -114,9 +109,6 @@ def fix_to_document(fix: Fix, compute_seconds: float) -> dict[str, Any]:
         "table_id": fix.table_id,
         "compute_ms": round(compute_seconds * 1e3, 3),
     }
-
-
-def _point(position: NDArray[np.float64]) -> dict[str, float]:
-    """Position as the wire has it, m."""
-    x, y, z = position.tolist()
-    return {"x": x, "y": y, "z": z}
+    if track is not None:
+        document["track"] = track_to_document(track, confidence)
+    return document

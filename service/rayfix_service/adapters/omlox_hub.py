@@ -1,0 +1,201 @@
+"""Telling an omlox hub of positions (omlox Hub API, version 2: ``PUT /providers/{provider_id}/location``).
+
+Locations wait in lanes, each sent one after the other, so that those of one target keep their order. Nothing here ever
+waits for the hub but the lanes: of a hub that is slow or gone, the oldest locations are dropped.
+"""
+
+import asyncio
+import logging
+import zlib
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from typing import Any, Literal
+from urllib.parse import quote, urlsplit
+
+import httpx
+
+from rayfix_service.adapters.omlox import fix_to_omlox
+from rayfix_service.fusion.report import Fix
+from rayfix_service.tracking.tracker import TrackedPosition
+from rayfix_tables.errors import RayfixError
+from rayfix_tables.site import SiteInfo
+
+_log = logging.getLogger(__name__)
+
+HubOutcome = Literal["sent", "refused", "dropped"]
+"""What became of a location: the hub took it, said that it never will, or there was no room or patience left."""
+
+_PASSING = frozenset({408, 425, 429, 500, 502, 503, 504})
+"""Statuses of a hub that may take the same location later."""
+
+
+class HubError(RayfixError):
+    """The hub's address cannot be used."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HubSettings:
+    """Where the hub is and how patiently it is told.
+
+    Attributes
+    ----------
+    url : str
+        Address of its API, such as ``http://hub:8081/v2``.
+    token : str or None
+        Sent as ``Authorization: Bearer``.
+    lanes : int
+        Locations that are on their way at a time.
+    capacity : int
+        Locations that wait in each lane.
+    attempts : int
+        Times that a location is sent at most.
+    first_pause, longest_pause : float, s
+        Before the second attempt, and at most; each is twice as long as that before.
+    timeout : float, s
+    """
+
+    url: str
+    token: str | None = field(default=None, repr=False)
+    lanes: int = 4
+    capacity: int = 256
+    attempts: int = 5
+    first_pause: float = 0.25
+    longest_pause: float = 5.0
+    timeout: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no address."""
+        parts = urlsplit(self.url)
+        if parts.scheme not in ("http", "https") or not parts.netloc or parts.query or parts.fragment:
+            raise HubError(f"omlox hub {self.url!r} is no address; give that of its API, e.g. http://hub:8081/v2")
+
+
+class OmloxHub:
+    """Sends locations to a hub in the background, within one event loop; see :func:`open_hub`.
+
+    Parameters
+    ----------
+    settings : HubSettings
+    on_outcome : callable, optional
+        Called with what became of each location.
+    """
+
+    def __init__(self, settings: HubSettings, *, on_outcome: Callable[[HubOutcome], None] | None = None) -> None:
+        self._settings = settings
+        self._on_outcome = on_outcome or (lambda outcome: None)
+        self._lanes = [_Lane() for _ in range(settings.lanes)]
+        self._failing = False
+
+    def tell(self, fix: Fix, site: SiteInfo, track: TrackedPosition | None = None) -> None:
+        """Send the position of a track or else of a fix, if there is one, and return at once."""
+        if track is not None or (fix.candidates and fix.regions is not None):
+            self.put(fix_to_omlox(fix, site, track))
+
+    def put(self, location: dict[str, Any]) -> None:
+        """Send a location and return at once."""
+        lane = self._lanes[zlib.crc32(location["provider_id"].encode()) % len(self._lanes)]
+        if len(lane.waiting) == self._settings.capacity:
+            lane.waiting.popleft()
+            self._on_outcome("dropped")
+        lane.waiting.append(location)
+        lane.filled.set()
+
+    @property
+    def num_waiting(self) -> int:
+        """Locations that wait or are on their way."""
+        return sum(len(lane.waiting) + lane.sending for lane in self._lanes)
+
+    async def run(self) -> None:
+        """Send until cancelled."""
+        headers = {} if self._settings.token is None else {"authorization": f"Bearer {self._settings.token}"}
+        async with (
+            httpx.AsyncClient(headers=headers, timeout=self._settings.timeout) as client,
+            asyncio.TaskGroup() as group,
+        ):
+            for lane in self._lanes:
+                group.create_task(self._run_lane(client, lane))
+
+    async def _run_lane(self, client: httpx.AsyncClient, lane: "_Lane") -> None:
+        while True:
+            await lane.filled.wait()
+            while lane.waiting:
+                lane.sending = True
+                outcome: HubOutcome = "dropped"
+                try:
+                    outcome = await self._send(client, lane.waiting.popleft())
+                except Exception:
+                    # A defect that one location meets must not end its lane.
+                    _log.exception("a location could not be sent")
+                lane.sending = False
+                self._on_outcome(outcome)
+            lane.filled.clear()
+
+    async def _send(self, client: httpx.AsyncClient, location: dict[str, Any]) -> HubOutcome:
+        settings = self._settings
+        url = f"{settings.url.rstrip('/')}/providers/{quote(location['provider_id'], safe='')}/location"
+        pause = settings.first_pause
+        for attempt in range(1, settings.attempts + 1):
+            try:
+                answer = await client.put(url, json=location)
+            except httpx.HTTPError as error:
+                reason = str(error) or type(error).__name__
+            else:
+                if answer.is_success:
+                    self._tell_once(failing=False, reason="")
+                    return "sent"
+                reason = f"status {answer.status_code}"
+                if answer.status_code not in _PASSING:
+                    self._tell_once(failing=True, reason=reason)
+                    return "refused"
+            self._tell_once(failing=True, reason=reason)
+            if attempt < settings.attempts:
+                await asyncio.sleep(pause)
+                pause = min(2.0 * pause, settings.longest_pause)
+        return "dropped"
+
+    def _tell_once(self, *, failing: bool, reason: str) -> None:
+        """Log the first failure of several, and their end."""
+        if failing and not self._failing:
+            _log.warning("the omlox hub %s does not take positions: %s", self._settings.url, reason)
+        elif self._failing and not failing:
+            _log.info("the omlox hub %s takes positions again", self._settings.url)
+        self._failing = failing
+
+
+@dataclass
+class _Lane:
+    """Locations in their order, and whether one is on its way."""
+
+    waiting: deque[dict[str, Any]] = field(default_factory=deque)
+    filled: asyncio.Event = field(default_factory=asyncio.Event)
+    sending: bool = False
+
+
+@asynccontextmanager
+async def open_hub(
+    settings: HubSettings | None,
+    *,
+    on_outcome: Callable[[HubOutcome], None] | None = None,
+    patience: float = 2.0,
+) -> AsyncIterator[OmloxHub | None]:
+    """Send in the background while the context lasts, and what waits then for `patience` seconds more.
+
+    Without settings there is no hub, and None.
+    """
+    if settings is None:
+        yield None
+        return
+    hub = OmloxHub(settings, on_outcome=on_outcome)
+    work = asyncio.create_task(hub.run())
+    try:
+        yield hub
+    finally:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(patience):
+                while hub.num_waiting:
+                    await asyncio.sleep(0.01)
+        work.cancel()
+        with suppress(asyncio.CancelledError):
+            await work
