@@ -1,6 +1,7 @@
 """The benchmarks of fixes run on a small table and print a figure for each case."""
 
 import runpy
+import shutil
 from pathlib import Path
 
 import pytest
@@ -99,3 +100,15 @@ def test_tracking(hall_table_path: Path, capsys: pytest.CaptureFixture[str], mon
     # With the coarse table and no times, the tracks of all stations' reports are better than the fixes by far.
     first = [float(line.split(kind)[1].split()[0]) for line, kind in zip(rows, ("fix", "track"), strict=False)]
     assert first[1] < 0.6 * first[0]
+
+
+@pytest.mark.slow
+def test_mqtt(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    if shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin:/usr/bin") is None:
+        pytest.skip("the MQTT broker mosquitto is not installed (Debian: apt-get install mosquitto)")
+    arguments = ["--table", str(hall_table_path), "--seconds", "1.5", "--track"]
+    sent, received, *latencies, _ = run("mqtt.py", capsys, monkeypatch, *arguments)
+    assert sent.startswith("1 tags at 40 Hz:")
+    assert " 60 packets in " in sent
+    assert received == "60 positions, 0 packets without"
+    assert latencies
