@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: viewer browser screenshots demo test lint types package accuracy clean
+.PHONY: viewer browser screenshots demo test lint types package accuracy openapi clean
 
 # The environment is made anew when what it holds has changed.
 $(VENV)/.done: pyproject.toml constraints.txt
@@ -48,6 +48,9 @@ package: $(VENV)/.done viewer
 
 accuracy: $(VENV)/.done
 	$(BIN)/python benchmarks/accuracy.py
+
+openapi: $(VENV)/.done
+	$(BIN)/python -m rayfix_service.http.openapi > docs/openapi.json
 
 clean:
 	rm -rf $(VENV) dist demo browser-artefacts $(dir $(VIEWER)) $(FRONTEND)/node_modules .pytest_cache .mypy_cache .ruff_cache
