@@ -22,6 +22,7 @@ from rayfix_service.http.examples import (
     UBLOX_EXAMPLES,
 )
 from rayfix_service.http.feed import QUEUE_LENGTH, FixFeed
+from rayfix_service.http.feed_relay import FeedRelay
 from rayfix_service.http.routes_stream import FixEventDocument
 from rayfix_service.wire import FixDocument, parse_report
 
@@ -207,6 +208,55 @@ def test_open_streams_do_not_hold_up_the_end(hall_table_path: Path, start_server
     assert server.process.returncode == -15
     assert "Traceback" not in log
     assert "ERROR" not in log
+
+
+def test_workers_tell_each_other(tmp_path: Path):
+    async def exchange() -> tuple[list[bytes], list[bytes], int]:
+        one, other = FixFeed(), FixFeed()
+        relays = [FeedRelay(one, tmp_path), FeedRelay(other, tmp_path)]
+        for number, relay in enumerate(relays):
+            relay._own = tmp_path / f"feed-{number}.sock"  # they would be of two processes
+        (tmp_path / "feed-9.sock").touch()  # of a worker that was killed
+        keeping = [asyncio.create_task(relay.keep()) for relay in relays]
+        await asyncio.sleep(0.05)
+        with one.subscribe() as here, one.subscribe(target_id="b") as of_b:
+            await relays[0].connect()
+            await relays[0].connect()  # does nothing
+            for target in ("a", "b", "line\nbreak"):
+                other.publish("hall", target, json.dumps(target).encode)
+            one.publish("hall", "own", lambda: b"{}")
+            events: list[bytes] = []
+            while len(events) < 4:
+                await here.wait(10)
+                events += [event.data for event in here.take()[1]]
+            of_b_alone = [event.data for event in of_b.take()[1]]
+            heard = other.num_listeners
+        for task in keeping:
+            task.cancel()
+        await asyncio.wait(keeping)
+        await asyncio.sleep(0.05)
+        return events, of_b_alone, heard
+
+    events, of_b_alone, heard = asyncio.run(exchange())
+    assert sorted(events) == sorted([b'"a"', b'"b"', b'"line\\nbreak"', b"{}"])
+    assert of_b_alone == [b'"b"']
+    assert heard == 0  # another worker is none that listens
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_listener_hears_of_all_workers(hall_table_path: Path, start_server: Callable[..., Any]):
+    with start_server(hall_table_path, workers=2) as server:
+        listener = Listener(server)
+        for number in range(20):  # each on a connection of its own, which either worker takes
+            with server.client() as http:
+                http.post("/v1/positions", json=REPORT | {"target_id": str(number)})
+        heard = [json.loads(listener.next()["data"])["fix"]["target_id"] for _ in range(20)]
+        with server.client() as http:
+            figures = http.get("/metrics").text
+        assert 'route="/v1/positions",status="200"} 20.0' in figures
+        listener.close()
+    assert sorted(heard, key=int) == [str(number) for number in range(20)]
 
 
 # --- the stream ------------------------------------------------------------------------------------------

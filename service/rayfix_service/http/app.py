@@ -17,6 +17,7 @@ from rayfix_service.http import routes_formats, routes_health, routes_positions,
 from rayfix_service.http.access import Access, describe_access
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.feed import FixFeed
+from rayfix_service.http.feed_relay import FeedRelay
 from rayfix_service.http.keys import ApiKeys
 from rayfix_service.http.metrics import Metrics, forget_dead_workers
 from rayfix_service.http.problems import Problem, install_problems
@@ -94,6 +95,9 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
         keeping = [asyncio.create_task(tables.keep(settings.watch_seconds))]
         if keys is not None:
             keeping.append(asyncio.create_task(_keep_keys(keys, settings.watch_seconds)))
+        if settings.runtime_folder is not None:
+            state.relay = FeedRelay(state.feed, settings.runtime_folder)
+            keeping.append(asyncio.create_task(state.relay.keep()))
         state.slow_fixes = SlowFixes(
             threads=settings.slow_fix_threads, waiting=settings.slow_fixes_waiting, seconds=settings.fix_seconds
         )
@@ -128,6 +132,7 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
     app.state.per_table = PerTable()
     app.state.metrics = Metrics()
     app.state.feed = FixFeed()
+    app.state.relay = None
     keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
     app.state.rate_limit = limit = _rate_limit(settings)
     app.add_middleware(Access, keys=keys, limit=limit)

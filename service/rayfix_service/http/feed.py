@@ -1,4 +1,4 @@
-"""The feed of fixes: every fix that this process locates, told to whoever listens."""
+"""The feed of fixes: every fix that is located, told to whoever listens."""
 
 import asyncio
 from collections import deque
@@ -39,9 +39,12 @@ class Subscription:
     ----------
     table, target_id : str, optional
         The only table and the only target to hear of.
+    own : bool
+        Whether to hear only of what this process located.
     """
 
-    def __init__(self, *, table: str | None = None, target_id: str | None = None) -> None:
+    def __init__(self, *, table: str | None = None, target_id: str | None = None, own: bool = False) -> None:
+        self.own = own
         self._table = table
         self._target_id = target_id
         self._events: deque[FixEvent] = deque(maxlen=QUEUE_LENGTH)
@@ -90,13 +93,15 @@ class FixFeed:
 
     @property
     def num_listeners(self) -> int:
-        """How many listen."""
-        return len(self._subscriptions)
+        """How many listen to the fixes of all processes."""
+        return sum(not subscription.own for subscription in self._subscriptions)
 
     @contextmanager
-    def subscribe(self, *, table: str | None = None, target_id: str | None = None) -> Iterator[Subscription]:
-        """Listen to all fixes, or to those of one table or target."""
-        subscription = Subscription(table=table, target_id=target_id)
+    def subscribe(
+        self, *, table: str | None = None, target_id: str | None = None, own: bool = False
+    ) -> Iterator[Subscription]:
+        """Listen to all fixes, or to those of one table or target, or of this process."""
+        subscription = Subscription(table=table, target_id=target_id, own=own)
         if self._closed:
             subscription.close()
         self._subscriptions.add(subscription)
@@ -106,12 +111,20 @@ class FixFeed:
             self._subscriptions.remove(subscription)
 
     def publish(self, table: str, target_id: str | None, make_data: Callable[[], bytes]) -> None:
-        """Tell of a fix; its JSON is only made where someone listens."""
-        if not self._subscriptions:
-            return
+        """Tell of a fix of this process; its JSON is only made where someone listens."""
+        if self._subscriptions:
+            self._put(self._event(table, target_id, make_data()), self._subscriptions)
+
+    def pass_on(self, table: str, target_id: str | None, data: bytes) -> None:
+        """Tell of a fix that another process located."""
+        self._put(self._event(table, target_id, data), {s for s in self._subscriptions if not s.own})
+
+    def _event(self, table: str, target_id: str | None, data: bytes) -> FixEvent:
         self._count += 1
-        event = FixEvent(number=self._count, table=table, target_id=target_id, data=make_data())
-        for subscription in self._subscriptions:
+        return FixEvent(number=self._count, table=table, target_id=target_id, data=data)
+
+    def _put(self, event: FixEvent, subscriptions: set[Subscription]) -> None:
+        for subscription in subscriptions:
             subscription.put(event)
 
     def close(self) -> None:

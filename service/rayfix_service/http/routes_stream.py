@@ -16,6 +16,7 @@ from rayfix_service.http.access import client_of
 from rayfix_service.http.dependencies import TablesDep, report_limit
 from rayfix_service.http.examples import FIX_EVENT_EXAMPLE
 from rayfix_service.http.feed import FixFeed
+from rayfix_service.http.feed_relay import FeedRelay
 from rayfix_service.http.locating import AnswererDep, native
 from rayfix_service.http.outputs import Output
 from rayfix_service.http.problems import (
@@ -83,15 +84,19 @@ async def get_fixes(
     if table is not None:
         tables.named(table)
     return EventStreamResponse(
-        _events(request.app.state.feed, table, target_id),
+        _events(request.app.state.feed, request.app.state.relay, table, target_id),
         # A proxy that gathers answers before it passes them on would gather these for ever.
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
 
 
-async def _events(feed: FixFeed, table: str | None, target_id: str | None) -> AsyncIterator[bytes]:
+async def _events(
+    feed: FixFeed, relay: FeedRelay | None, table: str | None, target_id: str | None
+) -> AsyncIterator[bytes]:
     """Write the events of a feed."""
     with feed.subscribe(table=table, target_id=target_id) as subscription:
+        if relay is not None:
+            await relay.connect()
         yield b"retry: %d\n\n" % _RETRY_MILLISECONDS
         while True:
             await subscription.wait(HEARTBEAT_SECONDS)
