@@ -118,6 +118,8 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--workers", type=int, default=1, help="processes that answer (default: 1)")
     serve.add_argument("--log-format", choices=("text", "json"), default="text", help="of the log (default: text)")
     serve.add_argument("--access-log", action="store_true", help="log a line per request")
+    serve.add_argument("--track", action="store_true", help="follow targets unless a request says otherwise")
+    _add_hub_argument(serve)
     serve.add_argument(
         "--allow-simulation",
         action="store_true",
@@ -391,6 +393,8 @@ def _serve(options: argparse.Namespace) -> int:
             api_keys=options.api_keys,
             reports_per_second=options.rate_limit,
             cors_origins=tuple(options.cors_origin),
+            track=options.track,
+            hub=_hub_settings(options),
             simulation=options.allow_simulation or is_loopback(options.host),
         ),
     )

@@ -12,6 +12,7 @@ from fastapi.middleware.cors import CORSMiddleware
 from pydantic.json_schema import models_json_schema
 
 from rayfix_service.adapters.nrppa_documents import NrppaDocument
+from rayfix_service.adapters.omlox_hub import open_hub
 from rayfix_service.adapters.silabs import SilabsDocument
 from rayfix_service.http import routes_formats, routes_health, routes_positions, routes_stream, routes_table
 from rayfix_service.http.access import Access, describe_access
@@ -109,10 +110,11 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
 
         try:
             with on_stop_signal(stop):
-                if settings.runtime_folder is not None:
-                    forget_dead_workers()
-                    await _take_turn(tables, settings.runtime_folder / "ready", stopping)
-                yield
+                async with open_hub(settings.hub, on_outcome=state.metrics.hub_told) as state.hub:
+                    if settings.runtime_folder is not None:
+                        forget_dead_workers()
+                        await _take_turn(tables, settings.runtime_folder / "ready", stopping)
+                    yield
         finally:
             stop()
             for task in keeping:

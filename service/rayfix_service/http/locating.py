@@ -5,14 +5,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends
 from pydantic_core import from_json, to_json
 from starlette.requests import HTTPConnection
 
 from rayfix_service.adapters.adapted import Adapted, error_in_message
-from rayfix_service.adapters.formats import OutputFormat, write
+from rayfix_service.adapters.formats import write
+from rayfix_service.adapters.omlox_hub import OmloxHub
 from rayfix_service.fusion.report import Fix, Report
 from rayfix_service.http.dependencies import TableDep
 from rayfix_service.http.feed import FixFeed
@@ -20,10 +21,14 @@ from rayfix_service.http.metrics import Metrics
 from rayfix_service.http.problems import ProblemError, internal_problem, problem_document, report_problem
 from rayfix_service.http.slow_fixes import SlowFixes, is_slow
 from rayfix_service.http.tables import ServedTable
+from rayfix_service.http.wanted import Wanted
+from rayfix_service.tracking.tracker import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report, report_to_document
 from rayfix_tables.errors import ReportError
 
 _log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,15 +73,16 @@ def foreign(adapted: Adapted) -> Incoming:
 
 @dataclass(frozen=True, kw_only=True)
 class Answerer:
-    """What answers reports: a table, the figures that it adds to, the feed that it tells, the threads for slow ones."""
+    """What answers reports: a table, the figures that it adds to, the feed and hub to tell, threads for slow ones."""
 
     table: ServedTable
     metrics: Metrics
     feed: FixFeed
     slow_fixes: SlowFixes
+    hub: OmloxHub | None
 
-    async def answer(self, incoming: Incoming, output: OutputFormat) -> dict[str, Any]:
-        """Locate a report and write the answer in a format.
+    async def answer(self, incoming: Incoming, wanted: Wanted) -> dict[str, Any]:
+        """Locate a report and write the answer as wanted.
 
         Raises
         ------
@@ -86,18 +92,21 @@ class Answerer:
             When the fix is slow and the service too busy.
         """
         try:
-            fix, seconds = await self._locate(incoming.report)
+            fix, track, seconds = await self._locate(incoming.report, wanted)
         except ReportError as error:
             if incoming.adapted is None:
                 raise
             raise error_in_message(error, incoming.adapted) from None
-        self.feed.publish(self.table.name, fix.target_id, partial(self._event, incoming, fix, seconds))
-        return write(fix, output, self.table.site, compute_seconds=seconds, adapted=incoming.adapted)
+        self.feed.publish(self.table.name, fix.target_id, partial(self._event, incoming, fix, track, seconds))
+        site = self.table.site
+        if self.hub is not None:
+            self.hub.tell(fix, site, track)
+        return write(fix, wanted.output, site, compute_seconds=seconds, adapted=incoming.adapted, track=track)
 
-    async def answer_or_problem(self, make: Callable[[], Incoming], output: OutputFormat) -> dict[str, Any]:
+    async def answer_or_problem(self, make: Callable[[], Incoming], wanted: Wanted) -> dict[str, Any]:
         """Answer one report of several, with a problem where it cannot be used."""
         try:
-            return await self.answer(make(), output)
+            return await self.answer(make(), wanted)
         except ReportError as error:
             return report_problem(error)
         except ProblemError as error:
@@ -107,25 +116,36 @@ class Answerer:
             _log.exception("a report of several failed")
             return internal_problem()
 
-    async def _locate(self, report: Report) -> tuple[Fix, float]:
-        """Locate a report; returns the fix and the time that it took, s.
+    async def _locate(self, report: Report, wanted: Wanted) -> tuple[Fix, TrackedPosition | None, float]:
+        """Locate a report; returns the fix, its target's track if that is wanted, and the time of the fix, s.
 
         A fix with an angle takes less than a millisecond or a few, right on the event loop. In the thread pool that
         FastAPI has for "def" such fixes would wait for each other's GIL; more worker processes use more cores.
         """
         start = perf_counter()
-        locate = self.table.locator.locate
-        fix = await self.slow_fixes.locate(locate, report) if is_slow(report) else locate(report)
+        if not wanted.follows(report):
+            fix = await self._wherever(self.table.locator.locate, report)
+            seconds = perf_counter() - start
+            self.metrics.fix_done(fix, seconds)
+            return fix, None, seconds
+        fused = await self._wherever(self.table.locator.fuse, report)
         seconds = perf_counter() - start
-        self.metrics.fix_done(fix, seconds)
-        return fix, seconds
+        self.metrics.fix_done(fused.fix, seconds)
+        track = self.table.tracker.follow(fused)
+        if track is not None:
+            self.metrics.track_done(track.state)
+        return fused.fix, track, seconds
 
-    def _event(self, incoming: Incoming, fix: Fix, seconds: float) -> bytes:
+    async def _wherever(self, locate: Callable[[Report], T], report: Report) -> T:
+        """Locate on the event loop, or in a thread what would take too long there."""
+        return await self.slow_fixes.locate(locate, report) if is_slow(report) else locate(report)
+
+    def _event(self, incoming: Incoming, fix: Fix, track: TrackedPosition | None, seconds: float) -> bytes:
         return to_json(
             {
                 "table": self.table.name,
                 "report": incoming.native_document(),
-                "fix": fix_to_document(fix, seconds),
+                "fix": fix_to_document(fix, seconds, track),
             }
         )
 
@@ -133,7 +153,7 @@ class Answerer:
 async def get_answerer(connection: HTTPConnection, table: TableDep) -> Answerer:
     """Return what answers, or end the request."""
     state = connection.app.state
-    return Answerer(table=table, metrics=state.metrics, feed=state.feed, slow_fixes=state.slow_fixes)
+    return Answerer(table=table, metrics=state.metrics, feed=state.feed, slow_fixes=state.slow_fixes, hub=state.hub)
 
 
 AnswererDep = Annotated[Answerer, Depends(get_answerer)]

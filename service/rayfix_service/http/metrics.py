@@ -8,7 +8,9 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Proc
 from prometheus_client.exposition import choose_encoder
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 
+from rayfix_service.adapters.omlox_hub import HubOutcome
 from rayfix_service.fusion.report import Fix, Status
+from rayfix_service.tracking.tracker import TrackState
 from rayfix_tables.table import Table
 
 MULTIPROCESS_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
@@ -49,6 +51,17 @@ class Metrics:
             registry=self._registry,
         )
         self._measurements = {name: measurements.labels(name) for name in ("used", "outlier", "unused")}
+        tracks = Counter(
+            "rayfix_tracks", "Reports by what they did to their target's track", ("state",), registry=self._registry
+        )
+        self._tracks = {state: tracks.labels(state) for state in get_args(TrackState)}
+        told = Counter(
+            "rayfix_omlox_locations",
+            "Positions for the omlox hub by what became of them: sent, refused by the hub, or dropped",
+            ("outcome",),
+            registry=self._registry,
+        )
+        self._told = {outcome: told.labels(outcome) for outcome in get_args(HubOutcome)}
         self._table = Gauge(
             "rayfix_table_info",
             "1 for each table that answers, 0 for those that did",
@@ -82,6 +95,14 @@ class Metrics:
         for outcome in fix.outcomes:
             name = "unused" if not outcome.used else "outlier" if (outcome.outlier_probability or 0) > 0.5 else "used"
             self._measurements[name].inc()
+
+    def track_done(self, state: TrackState) -> None:
+        """Count a report that was taken into a track."""
+        self._tracks[state].inc()
+
+    def hub_told(self, outcome: HubOutcome) -> None:
+        """Count a position for the omlox hub."""
+        self._told[outcome].inc()
 
     def table_loaded(self, name: str, table: Table) -> None:
         """Tell that a table answers."""

@@ -1,12 +1,10 @@
-"""What routes of positions share: the query parameter ``output``, and their part of the OpenAPI document."""
+"""What routes of positions share: their part of the OpenAPI document."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from fastapi import Query
 from pydantic import BaseModel, Field
 
-from rayfix_service.adapters.formats import OutputFormat
 from rayfix_service.http.examples import (
     ADAPTED_FIX_EXAMPLE,
     FIX_EXAMPLE,
@@ -27,12 +25,6 @@ from rayfix_service.http.problems import (
 )
 from rayfix_service.wire import FixDocument, Point
 from rayfix_service.wire.response import OutcomeDocument
-
-Output = Annotated[
-    OutputFormat,
-    Query(description="format of the answer: this service's own, 3GPP TS 29.572 local 3D point, or omlox location"),
-]
-"""Query parameter ``output``."""
 
 
 class AdaptedOutcome(OutcomeDocument):

@@ -20,11 +20,11 @@ from rayfix_service.http.outputs import (
     ADAPTED_ANSWER,
     POSITION_PROBLEMS,
     AdaptedOrOther,
-    Output,
     request_body,
 )
 from rayfix_service.http.patience import Patience
 from rayfix_service.http.problems import MALFORMED_JSON, Problem
+from rayfix_service.http.wanted import WantedDep
 
 router = APIRouter(prefix="/v1/positions", tags=["formats"])
 
@@ -44,9 +44,9 @@ class LinesResult(BaseModel):
     responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(NrppaDocument, NRPPA_EXAMPLES),
 )
-async def post_nrppa(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JsonAnswer:
+async def post_nrppa(answerer: AnswererDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    return JsonAnswer(await answerer.answer(foreign(parse_nrppa(body)), output))
+    return JsonAnswer(await answerer.answer(foreign(parse_nrppa(body)), wanted), media_type=wanted.media_type)
 
 
 @router.post(
@@ -56,9 +56,9 @@ async def post_nrppa(answerer: AnswererDep, body: ReportBody, output: Output = "
     responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(SilabsDocument, SILABS_EXAMPLES),
 )
-async def post_silabs(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JsonAnswer:
+async def post_silabs(answerer: AnswererDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    return JsonAnswer(await answerer.answer(foreign(parse_silabs(body)), output))
+    return JsonAnswer(await answerer.answer(foreign(parse_silabs(body)), wanted), media_type=wanted.media_type)
 
 
 @router.post(
@@ -77,7 +77,7 @@ async def post_ublox(
     request: Request,
     answerer: AnswererDep,
     body: LinesBody,
-    output: Output = "native",
+    wanted: WantedDep,
     station: Annotated[list[str], Query(description="ANCHOR=STATION, for anchors whose id is no station's")] = [],  # noqa: B006
     height_m: Annotated[float | None, Query(description="known height of the tags, z in the scene frame, m")] = None,
     height_stdev_m: Annotated[float | None, Query(description="its standard deviation, m")] = None,
@@ -90,5 +90,5 @@ async def post_ublox(
     patience = Patience(request)
     for adapted in messages:
         await patience.take_a_breath()
-        results.append(await answerer.answer_or_problem(partial(foreign, with_height(adapted, known)), output))
+        results.append(await answerer.answer_or_problem(partial(foreign, with_height(adapted, known)), wanted))
     return JsonAnswer({"results": results})

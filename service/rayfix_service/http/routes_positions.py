@@ -13,9 +13,10 @@ from rayfix_service.http.dependencies import BatchBody, ReportBody, get_table, r
 from rayfix_service.http.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
 from rayfix_service.http.json_answer import JsonAnswer
 from rayfix_service.http.locating import AnswererDep, get_answerer, native
-from rayfix_service.http.outputs import NATIVE_ANSWER, POSITION_PROBLEMS, NativeOrOther, Output, request_body
+from rayfix_service.http.outputs import NATIVE_ANSWER, POSITION_PROBLEMS, NativeOrOther, request_body
 from rayfix_service.http.patience import Patience
 from rayfix_service.http.problems import Problem
+from rayfix_service.http.wanted import WantedDep, get_wanted
 from rayfix_service.wire import (
     MAX_REPORTS,
     BatchDocument,
@@ -31,8 +32,7 @@ class BatchResult(BaseModel):
     """The answers to a batch, in the order of its reports."""
 
     results: list[NativeOrOther | Problem] = Field(
-        description="a fix in the format of the query parameter output, or the problem of that report, whose paths "
-        "start at the report"
+        description="a fix in the format that is wanted, or the problem of that report, whose paths start at the report"
     )
 
 
@@ -51,7 +51,7 @@ class PositionRoute(APIRoute):
             if request.scope["query_string"]:
                 return await handle_any(request)
             answerer = await get_answerer(request, await get_table(request))
-            return await post_position(answerer, await read_report_body(request))
+            return await post_position(answerer, await read_report_body(request), await get_wanted(request))
 
         return handle
 
@@ -67,9 +67,9 @@ single_router = APIRouter(prefix="/v1", tags=["positions"], route_class=Position
     responses={**NATIVE_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(ReportDocument, REPORT_EXAMPLES),
 )
-async def post_position(answerer: AnswererDep, body: ReportBody, output: Output = "native") -> JsonAnswer:
+async def post_position(answerer: AnswererDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
-    return JsonAnswer(await answerer.answer(native(body), output))
+    return JsonAnswer(await answerer.answer(native(body), wanted), media_type=wanted.media_type)
 
 
 @router.post(
@@ -79,7 +79,7 @@ async def post_position(answerer: AnswererDep, body: ReportBody, output: Output 
     responses=POSITION_PROBLEMS,
     openapi_extra=request_body(BatchDocument, BATCH_EXAMPLES),
 )
-async def post_batch(request: Request, answerer: AnswererDep, body: BatchBody, output: Output = "native") -> JsonAnswer:
+async def post_batch(request: Request, answerer: AnswererDep, body: BatchBody, wanted: WantedDep) -> JsonAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
     documents = _batch_reports(read_json(body))
     if (limit := request.app.state.rate_limit) is not None:
@@ -88,7 +88,7 @@ async def post_batch(request: Request, answerer: AnswererDep, body: BatchBody, o
     patience = Patience(request)
     for document in documents:
         await patience.take_a_breath()
-        results.append(await answerer.answer_or_problem(partial(native, document), output))
+        results.append(await answerer.answer_or_problem(partial(native, document), wanted))
     return JsonAnswer({"results": results})
 
 

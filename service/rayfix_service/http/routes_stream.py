@@ -18,7 +18,6 @@ from rayfix_service.http.examples import FIX_EVENT_EXAMPLE
 from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.feed_relay import FeedRelay
 from rayfix_service.http.locating import AnswererDep, native
-from rayfix_service.http.outputs import Output
 from rayfix_service.http.problems import (
     BODY_TOO_LARGE,
     INVALID_PARAMETER,
@@ -28,6 +27,7 @@ from rayfix_service.http.problems import (
     problem_responses,
 )
 from rayfix_service.http.rates import RateLimit
+from rayfix_service.http.wanted import WantedDep
 from rayfix_service.wire import FixDocument, ReportDocument
 
 router = APIRouter(prefix="/v1", tags=["streams"])
@@ -112,7 +112,7 @@ async def _events(
 
 
 @router.websocket("/stream")
-async def stream(websocket: WebSocket, answerer: AnswererDep, output: Output = "native") -> None:
+async def stream(websocket: WebSocket, answerer: AnswererDep, wanted: WantedDep) -> None:
     """Answer each message, a report, with a fix or a problem, in their order.
 
     The next message is read when the last answer is on its way, so that a client that sends faster than it is
@@ -134,7 +134,7 @@ async def stream(websocket: WebSocket, answerer: AnswererDep, output: Output = "
                     BODY_TOO_LARGE, f"the message is longer than {limit} bytes; send fewer measurements at once"
                 )
             else:
-                answer = await answerer.answer_or_problem(partial(native, body), output)
+                answer = await answerer.answer_or_problem(partial(native, body), wanted)
             await websocket.send_text(to_json(answer, inf_nan_mode="null").decode())
             await asyncio.sleep(0)  # whatever else is on the loop comes in between
     except WebSocketDisconnect:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rayfix_service.adapters.omlox_hub import HubSettings
+
 
 @dataclass(frozen=True, kw_only=True)
 class BodyLimits:
@@ -32,6 +34,10 @@ class ServiceSettings:
         Slow fixes that are computed at a time, and that may wait for it.
     watch_seconds : float
         Time between two looks at the files of the tables and keys.
+    track : bool
+        Whether targets are followed where a request does not say.
+    hub : HubSettings, optional
+        Omlox hub that is told of all positions.
     simulation : bool
         Whether ``POST /v1/simulations`` answers.
     runtime_folder : pathlib.Path, optional
@@ -47,5 +53,7 @@ class ServiceSettings:
     slow_fix_threads: int = 2
     slow_fixes_waiting: int = 32
     watch_seconds: float = 2.0
+    track: bool = False
+    hub: HubSettings | None = None
     simulation: bool = False
     runtime_folder: Path | None = None

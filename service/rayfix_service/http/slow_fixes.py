@@ -3,9 +3,12 @@
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
-from rayfix_service.fusion.report import Angle, Fix, Report
+from rayfix_service.fusion.report import Angle, Report
 from rayfix_service.http.problems import FIX_TIMEOUT, OVERLOADED, ProblemError
+
+T = TypeVar("T")
 
 _MEASUREMENTS_ON_LOOP = 16
 
@@ -39,7 +42,7 @@ class SlowFixes:
         self._seconds = seconds
         self._under_way = 0
 
-    async def locate(self, locate: Callable[[Report], Fix], report: Report) -> Fix:
+    async def locate(self, locate: Callable[[Report], T], report: Report) -> T:
         """Locate a report in a thread.
 
         Raises
@@ -67,7 +70,7 @@ class SlowFixes:
                 FIX_TIMEOUT, f"the fix took longer than {self._seconds:g} s; send fewer measurements"
             ) from None
 
-    def _done(self, work: "asyncio.Future[Fix]") -> None:
+    def _done(self, work: "asyncio.Future[T]") -> None:
         self._under_way -= 1
         if not work.cancelled():
             work.exception()  # seen, also of one that was given up

@@ -10,6 +10,7 @@ from typing import Literal
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.http.metrics import Metrics
 from rayfix_service.http.problems import INVALID_PARAMETER, NOT_FOUND, NOT_READY, ProblemError
+from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire import FieldProblem
 from rayfix_tables.errors import RayfixError, TableError
 from rayfix_tables.site import SiteInfo
@@ -32,12 +33,15 @@ class ServedTable:
     name : str
         Its file's name without the suffix.
     locator : Locator
+    tracker : Tracker
+        Targets followed with this table; those of a table that is swapped begin anew.
     state : tuple of int
         Of the file that it was read from.
     """
 
     name: str
     locator: Locator
+    tracker: Tracker
     state: FileState
 
     @property
@@ -109,7 +113,9 @@ def load_table(name: str, path: Path) -> ServedTable:
         raise TableError(f"{path} changed while it was read; write tables beside and rename them into place")
     locator = Locator(table)
     locator.warm_up()
-    return ServedTable(name=name, locator=locator, state=state)
+    tracker = Tracker(table.scene)
+    tracker.warm_up()
+    return ServedTable(name=name, locator=locator, tracker=tracker, state=state)
 
 
 class Tables:

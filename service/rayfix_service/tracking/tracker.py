@@ -96,6 +96,10 @@ class Tracker:
         """Return the number of targets."""
         return len(self._tracks)
 
+    def warm_up(self) -> None:
+        """Compile the kernels."""
+        self._walls.passable(np.zeros((1, 3)), np.zeros((1, 3)))
+
     def follow(self, fused: Fused) -> TrackedPosition | None:
         """Take a report into its target's track, and tell where the target is.
 
