@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: viewer browser screenshots demo test lint types package accuracy openapi clean
+.PHONY: viewer browser screenshots demo test lint types package images accuracy openapi clean
 
 # The environment is made anew when what it holds has changed.
 $(VENV)/.done: pyproject.toml constraints.txt
@@ -45,6 +45,10 @@ package: $(VENV)/.done viewer
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
 	$(BIN)/python tests/package/check_wheel.py dist
+
+# The images, built and run without a container engine: as root, with buildah and debootstrap.
+images: $(VENV)/.done viewer
+	$(BIN)/python docker/test_images.py
 
 accuracy: $(VENV)/.done
 	$(BIN)/python benchmarks/accuracy.py

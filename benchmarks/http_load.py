@@ -1,6 +1,6 @@
 """Requests per second of the service, beside a plain FastAPI endpoint that computes nothing, and its memory.
 
-    python benchmarks/http_load.py hall.h5 [--workers 1 2] [--seconds 5] [--rounds 3] [--memory 200000 | --swaps 20]
+    python benchmarks/http_load.py hall.h5 [--workers 1 2] [--seconds 5] [--rounds 3] [--memory 200000]
 
 The load comes from `wrk` (Debian package wrk) over 16 connections on loopback. Both servers are uvicorn with the same
 settings; the plain one validates the same report with the same models and answers with the example of a fix. They take
@@ -9,7 +9,6 @@ turns, and the medians of the rounds are compared, since other work on the machi
 
 import argparse
 import json
-import os
 import re
 import shutil
 import statistics
@@ -18,7 +17,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -160,27 +158,6 @@ def memory(table: Path, requests: int) -> None:
             print(f"{done:9.0f} requests   {int(resident) / 1024:7.1f} MiB   failed {run.failed}", flush=True)
 
 
-def swaps(table: Path, times: int, workers: int) -> None:
-    """Put a new file in the table's place over and over under load, then end the service with its signal."""
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(1) as pool:
-        place = Path(shutil.copy(table, folder))
-        with server(rayfix_command(place, workers)) as (url, _):
-            begin = time.monotonic()
-            loading = [pool.submit(load, url, "/v1/positions", REPORT, seconds=10)]
-            for _ in range(times):
-                os.replace(shutil.copy(table, place.with_suffix(".new")), place)
-                answer = httpx.post(f"{url}/v1/tables/reload", timeout=60, trust_env=False)
-                assert answer.json()["tables"][0]["change"] == "loaded", answer.text
-                if loading[-1].done():
-                    loading.append(pool.submit(load, url, "/v1/positions", REPORT, seconds=10))
-            runs = [run.result() for run in loading]
-            print(
-                f"{workers} workers  {times} tables swapped in {time.monotonic() - begin:.0f} s under "
-                f"{statistics.mean(run.per_second for run in runs):.0f} requests/s   "
-                f"p99 {max(run.p99_ms for run in runs):.1f} ms   failed {sum(run.failed for run in runs)}"
-            )
-
-
 def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -189,16 +166,11 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="of each run (default: 5)")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--memory", type=int, metavar="REQUESTS", help="watch the memory over so many instead")
-    parser.add_argument("--swaps", type=int, metavar="TIMES", help="swap the table under load instead")
     options = parser.parse_args()
     if shutil.which("wrk") is None:
         sys.exit("wrk is missing; install the Debian package wrk")
     if options.memory:
         memory(options.table, options.memory)
-        return
-    if options.swaps:
-        for workers in options.workers:
-            swaps(options.table, options.swaps, workers)
         return
     for workers in options.workers:
         compare(options.table, workers, options.seconds, options.rounds)

@@ -1,0 +1,59 @@
+{{/* Name of everything in this release. */}}
+{{- define "rayfix.name" -}}
+{{- $name := contains "rayfix" .Release.Name | ternary .Release.Name (printf "%s-rayfix" .Release.Name) -}}
+{{ $name | trunc 40 | trimSuffix "-" }}
+{{- end }}
+
+{{/* Labels that select; a part is added by each user. */}}
+{{- define "rayfix.selector" -}}
+app.kubernetes.io/name: rayfix
+app.kubernetes.io/instance: {{ .Release.Name }}
+{{- end }}
+
+{{- define "rayfix.labels" -}}
+{{ include "rayfix.selector" . }}
+app.kubernetes.io/version: {{ .Chart.AppVersion | quote }}
+app.kubernetes.io/managed-by: {{ .Release.Service }}
+helm.sh/chart: {{ .Chart.Name }}-{{ .Chart.Version }}
+{{- end }}
+
+{{/* Reference of an image: call with a list of the context and an entry of .Values.images. */}}
+{{- define "rayfix.image" -}}
+{{- $context := index . 0 }}{{ $image := index . 1 -}}
+{{- if $image.digest -}}
+{{ $image.repository }}@{{ $image.digest }}
+{{- else -}}
+{{ $image.repository }}:{{ $image.tag | default $context.Chart.AppVersion }}
+{{- end }}
+{{- end }}
+
+{{/* What decides the table: a change of it makes a new job, a new file and a rollout. */}}
+{{- define "rayfix.revision" -}}
+{{- if eq .Values.table.source "url" -}}
+{{ .Values.table.id | trunc 12 }}
+{{- else -}}
+{{ printf "%s %s" (toJson .Values.site) (include "rayfix.image" (list . .Values.images.offline)) | sha256sum | trunc 12 }}
+{{- end }}
+{{- end }}
+
+{{- define "rayfix.tableFile" -}}
+site-{{ include "rayfix.revision" . }}.h5
+{{- end }}
+
+{{- define "rayfix.claim" -}}
+{{ .Values.table.claim.existing | default (printf "%s-tables" (include "rayfix.name" .)) }}
+{{- end }}
+
+{{- define "rayfix.podSecurity" -}}
+runAsNonRoot: true
+runAsUser: 10001
+runAsGroup: 10001
+fsGroup: 10001
+seccompProfile: {type: RuntimeDefault}
+{{- end }}
+
+{{- define "rayfix.containerSecurity" -}}
+readOnlyRootFilesystem: true
+allowPrivilegeEscalation: false
+capabilities: {drop: [ALL]}
+{{- end }}

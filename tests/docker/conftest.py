@@ -1,0 +1,9 @@
+"""Where the deployment's files are."""
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# The scripts of the images import each other, as they do when they are run.
+sys.path[:0] = [str(ROOT / "docker"), str(ROOT / "docker/stages")]
