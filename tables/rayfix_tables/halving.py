@@ -20,7 +20,7 @@ SMALLEST_PIVOT = 1e-30
 """A covariance that rounding has made singular counts as this thin."""
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, noise: Any, max_divergence: Any) -> Any:
     """Merge components, in place.
 
@@ -32,9 +32,10 @@ def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, no
     cov : ndarray of shape (n, d, d)
     group : ndarray of int64, shape (n,)
         Components of different groups are not merged.
-    scale : ndarray of shape (d,)
-        Lengths in the units of which the sides of a box are compared.
-    noise : ndarray of shape (d,)
+    scale : tuple of d floats, or ndarray of shape (d,)
+        Lengths in the units of which the sides of a box are compared. With a tuple, d is known when this is compiled,
+        which makes it twice as fast.
+    noise : tuple of d floats, or ndarray of shape (d,)
         Variances of the noise that measurements add.
     max_divergence : float
         What a merge may cost, nats.
@@ -44,7 +45,7 @@ def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, no
     ndarray of int64, shape (n,)
         Component that each one has become part of; its own number where it is left.
     """
-    count, dimension = mean.shape
+    count, dimension = len(mean), len(scale)
     order, left, right, size = _tree(mean, group, scale)
     log_det = np.empty(count)
     work = np.empty((dimension, dimension))
@@ -65,16 +66,15 @@ def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, no
         for a in range(dimension):
             apart = share * (1.0 - share) * (mean[i, a] - mean[j, a])
             for b in range(a + 1):
-                value = cov[j, a, b] + share * (cov[i, a, b] - cov[j, a, b]) + apart * (mean[i, b] - mean[j, b])
-                union[a, b] = value
-                union[b, a] = value
+                union[a, b] = cov[j, a, b] + share * (cov[i, a, b] - cov[j, a, b]) + apart * (mean[i, b] - mean[j, b])
         united = _noisy_log_det(union, noise, work)
         if 0.5 * (total * united - weight[i] * log_det[i] - weight[j] * log_det[j]) > max_divergence:
             continue
         for a in range(dimension):
             mean[i, a] = mean[j, a] + share * (mean[i, a] - mean[j, a])
-            for b in range(dimension):
+            for b in range(a + 1):
                 cov[i, a, b] = union[a, b]
+                cov[i, b, a] = union[a, b]
         weight[i] = total
         log_det[i] = united
         into[j] = i
@@ -85,7 +85,7 @@ def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, no
     return into
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _tree(mean: Any, group: Any, scale: Any) -> Any:
     """Halve groups and then their boxes until each holds one component.
 
@@ -97,12 +97,14 @@ def _tree(mean: Any, group: Any, scale: Any) -> Any:
     size : int
         Number of nodes.
     """
-    count, dimension = mean.shape
+    count, dimension = len(mean), len(scale)
     order = np.arange(count)
     most = 2 * count - 1
     first, stop = np.empty(most, np.int64), np.empty(most, np.int64)
     left, right = np.empty(most, np.int64), np.empty(most, np.int64)
-    first[0], stop[0] = 0, count
+    mixed = np.zeros(most, np.bool_)
+    low, high = np.empty(dimension), np.empty(dimension)
+    first[0], stop[0], mixed[0] = 0, count, True
     size = 1
     node = 0
     while node < size:
@@ -111,20 +113,27 @@ def _tree(mean: Any, group: Any, scale: Any) -> Any:
             left[node], right[node] = -1, begin
             node += 1
             continue
-        least, greatest = group[order[begin]], group[order[begin]]
-        for n in range(begin, end):
-            least, greatest = min(least, group[order[n]]), max(greatest, group[order[n]])
-        longest, axis, middle = -1.0, 0, 0.0
-        for a in range(dimension):
-            low, high = np.inf, -np.inf
+        least = group[order[begin]]
+        if mixed[node]:  # what a box of one group is cut into is, too
+            greatest = least
             for n in range(begin, end):
-                low, high = min(low, mean[order[n], a]), max(high, mean[order[n], a])
-            if (high - low) / scale[a] > longest:
-                longest, axis, middle = (high - low) / scale[a], a, 0.5 * (low + high)
+                least, greatest = min(least, group[order[n]]), max(greatest, group[order[n]])
+            mixed[node] = greatest > least
+        for a in range(dimension):
+            low[a], high[a] = np.inf, -np.inf
+        for n in range(begin, end):
+            component = order[n]
+            for a in range(dimension):
+                low[a], high[a] = min(low[a], mean[component, a]), max(high[a], mean[component, a])
+        longest, axis = -1.0, 0
+        for a in range(dimension):
+            if (high[a] - low[a]) / scale[a] > longest:
+                longest, axis = (high[a] - low[a]) / scale[a], a
+        middle = 0.5 * (low[axis] + high[axis])
         i, j = begin, end - 1
         while i <= j:
             component = order[i]
-            if (group[component] == least) if greatest > least else (mean[component, axis] < middle):
+            if (group[component] == least) if mixed[node] else (mean[component, axis] < middle):
                 i += 1
             else:
                 order[i], order[j] = order[j], order[i]
@@ -133,16 +142,16 @@ def _tree(mean: Any, group: Any, scale: Any) -> Any:
             i = (begin + end) // 2
         left[node], right[node] = size, size + 1
         first[size], stop[size] = begin, i
-        first[size + 1], stop[size + 1] = i, end
+        first[size + 1], stop[size + 1], mixed[size + 1] = i, end, mixed[node]
         size += 2
         node += 1
     return order, left, right, size
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _noisy_log_det(cov: Any, noise: Any, work: Any) -> Any:
     """Logarithm of the determinant of a covariance with noise; ``work`` has its shape."""
-    dimension = len(cov)
+    dimension = len(noise)
     for a in range(dimension):
         for b in range(a + 1):
             work[a, b] = cov[a, b]

@@ -125,7 +125,7 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
             top = max(top, value)
             if kept < most:
                 parent[kept], choice[kept], score[kept] = h, k, value
-                _sift_up(score, heap, kept)
+                _sift_up(score, heap[: kept + 1])
                 kept += 1
             elif value > score[heap[0]]:
                 slot = heap[0]
@@ -136,10 +136,10 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
 
 
 @numba.njit(cache=True, nogil=True)
-def _sift_up(scores: Any, heap: Any, last: Any) -> None:
-    """Take the entry ``last``, which has come to it, into the heap whose least score is at ``heap[0]``."""
-    i = last
-    heap[i] = last
+def _sift_up(scores: Any, heap: Any) -> None:
+    """Take the last entry, which is new, into the heap whose least score is at ``heap[0]``."""
+    i = len(heap) - 1
+    heap[i] = i
     while i > 0 and scores[heap[(i - 1) // 2]] > scores[heap[i]]:
         up = (i - 1) // 2
         heap[i], heap[up] = heap[up], heap[i]

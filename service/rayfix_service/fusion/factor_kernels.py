@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from rayfix_service.fusion.kernels import LOG_2PI
-from rayfix_service.fusion.merging import merge_gaussians
+from rayfix_service.fusion.merging import NO_NOISE, merge_gaussians
 from rayfix_service.fusion.natural import integrate_last, invert_all, triangle
 
 ALL_GOOD, TIME_OUTLIER, ALL_OUTLIER = 0, 1, 2
@@ -102,7 +102,7 @@ def make_alternatives(
             condition_on_length(own_mean, own_cov, part.length, part.length_variance)
         # The divergence of all parts together is what counts, though a part may turn out to be the right one.
         allowed = max_divergence * np.exp(min(top - tops[p], RELAXED))
-        left = merge_gaussians(own_log, own_mean, own_cov, np.zeros(4), allowed)
+        left = merge_gaussians(own_log, own_mean, own_cov, NO_NOISE, allowed)
         own_readings = readings[part.first_reading : part.last_reading]
         out = slice(done, done + len(left))
         to_columns(own_log[left], own_mean[left], own_cov[left], own_readings, dimension, columns[:, out])

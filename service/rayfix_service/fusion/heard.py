@@ -60,7 +60,7 @@ class HeardStation:
     def everywhere(self) -> Heard:
         """Gaussians of the paths of all directions, those merged that no path length tells apart."""
         heard = _condition(look_up(self.part.levels, NO_DIRECTION))
-        left = merge_gaussians(*heard, np.array([0.0, 0.0, 0.0, _RANGE_STDEV**2]), _MAX_DIVERGENCE)
+        left = merge_gaussians(*heard, (0.0, 0.0, 0.0, _RANGE_STDEV**2), _MAX_DIVERGENCE)
         return Heard(*(array[left] for array in heard))
 
 
@@ -80,8 +80,8 @@ def _condition(lookup: Lookup) -> Heard:
         mixture.x_cov,
         begins,
         ends,
-        lookup.rest_mean,
-        lookup.rest_cov,
+        np.ascontiguousarray(lookup.rest_mean),
+        np.ascontiguousarray(lookup.rest_cov),
         lookup.log_factor + level.cell_log_mass[lookup.cells],
         *heard,
     )

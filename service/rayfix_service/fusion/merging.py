@@ -14,17 +14,21 @@ from rayfix_service.fusion.kernels import LOG_2PI
 from rayfix_service.fusion.natural import dimension_of, invert_all, triangle
 from rayfix_tables.halving import halve_and_merge
 
+_ONES = (1.0, 1.0, 1.0, 1.0)
+
+NO_NOISE = (0.0, 0.0, 0.0, 0.0)
+
 
 @numba.njit(cache=True, nogil=True)
 def merge_gaussians(log_weight: Any, mean: Any, cov: Any, noise: Any, max_divergence: Any) -> Any:
-    """Merge weighted Gaussians, in place.
+    """Merge weighted Gaussians over (position, path length), in place.
 
     Parameters
     ----------
     log_weight : ndarray of shape (n,)
-    mean : ndarray of shape (n, d)
-    cov : ndarray of shape (n, d, d)
-    noise : ndarray of shape (d,)
+    mean : ndarray of shape (n, 4), m
+    cov : ndarray of shape (n, 4, 4), m2
+    noise : tuple of 4 floats, m2
         Variances under which Gaussians are told apart.
     max_divergence : float
         What a merge may cost, nats.
@@ -34,7 +38,7 @@ def merge_gaussians(log_weight: Any, mean: Any, cov: Any, noise: Any, max_diverg
     ndarray of int64, shape (m,)
         Those that are left.
     """
-    count, size = mean.shape
+    count = len(mean)
     if count < 2:
         return np.arange(count)
     top = log_weight.max()
@@ -42,7 +46,7 @@ def merge_gaussians(log_weight: Any, mean: Any, cov: Any, noise: Any, max_diverg
     total = weight.sum()
     weight /= total
     one_group = np.zeros(count, np.int64)
-    into = halve_and_merge(weight, mean, cov, one_group, np.ones(size), noise, max_divergence)
+    into = halve_and_merge(weight, mean, cov, one_group, _ONES, noise, max_divergence)
     left = np.flatnonzero(into == np.arange(count))
     for n in left:
         log_weight[n] = np.log(weight[n] * total) + top
@@ -81,7 +85,14 @@ def merge_hypotheses(columns: Any, score: Any, pattern: Any, max_divergence: Any
     total = weight.sum()
     weight /= total
     mean, cov = _moments(columns, packed, proper)
-    into = halve_and_merge(weight, mean, cov, pattern[proper], np.ones(size), np.zeros(size), max_divergence)
+    # Most reports have no clock, or one. Of these the compiler knows the dimension.
+    group = pattern[proper]
+    if size == 3:
+        into = halve_and_merge(weight, mean, cov, group, _ONES[:3], NO_NOISE[:3], max_divergence)
+    elif size == 4:
+        into = halve_and_merge(weight, mean, cov, group, _ONES, NO_NOISE, max_divergence)
+    else:
+        into = halve_and_merge(weight, mean, cov, group, np.ones(size), np.zeros(size), max_divergence)
     stays, has_grown = np.ones(len(score), np.bool_), np.zeros(len(proper), np.bool_)
     for n in range(len(proper)):
         if into[n] != n:

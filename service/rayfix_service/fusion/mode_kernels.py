@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from rayfix_service.fusion.kernels import cholesky, invert
-from rayfix_service.fusion.voxels import is_free, nearest_free
+from rayfix_service.fusion.voxels import is_free, is_free_place, nearest_free
 
 
 @numba.njit(cache=True, nogil=True)
@@ -106,14 +106,12 @@ def find_hills(
             position[member[h], i] += weight[h] * mean[h, i]
     for n in range(len(top)):
         position[n] /= probability[n]
-        x, y, z = (position[n] - origin) / voxel_size
-        if not is_free(free, x, y, z):
+        if not is_free_place(free, origin, voxel_size, position[n]):
             position[n] = top[n]
     moment = _second_moments(weight, mean, cov, member, probability, position)
     moved = False
     for n in range(len(top)):
-        x, y, z = (position[n] - origin) / voxel_size
-        if not is_free(free, x, y, z):
+        if not is_free_place(free, origin, voxel_size, position[n]):
             moved |= nearest_free(position[n], moment[n], near, origin, voxel_size, free)
     if moved:
         moment = _second_moments(weight, mean, cov, member, probability, position)
@@ -159,8 +157,7 @@ def climb(log_density: Any, mean: Any, precision: Any, start: Any) -> Any:
     curvature : ndarray of shape (3, 3), 1 / m2
         Mean precision of the hypotheses there.
     """
-    nowhere = np.empty((0, 3))
-    mode, curvature, _ = _climb(log_density, mean, precision, start, nowhere, np.empty((0, 3, 3)), 0)
+    mode, curvature, _ = _climb(log_density, mean, precision, start, np.empty((0, 3)), np.empty((0, 3, 3)))
     return mode, curvature
 
 
@@ -189,7 +186,7 @@ def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any) -> Any:
     curvature = np.empty((count, 3, 3))
     found = 0
     for h in np.argsort(-log_density):
-        mode, here, hill = _climb(log_density, mean, precision, mean[h], top, curvature, found)
+        mode, here, hill = _climb(log_density, mean, precision, mean[h], top[:found], curvature[:found])
         for n in range(found):
             if hill >= 0:
                 break
@@ -215,7 +212,7 @@ def _square(x: Any, y: Any, precision: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _climb(log_density: Any, mean: Any, precision: Any, start: Any, top: Any, curvature: Any, found: Any) -> Any:
+def _climb(log_density: Any, mean: Any, precision: Any, start: Any, top: Any, curvature: Any) -> Any:
     """Climb until a mode is reached, or the place where one of those found already attracts (its number comes last)."""
     count = len(log_density)
     x = start.copy()
@@ -225,7 +222,7 @@ def _climb(log_density: Any, mean: Any, precision: Any, start: Any, top: Any, cu
     lower = np.empty((3, 3))
     inverse = np.empty((3, 3))
     for _ in range(500):
-        for n in range(found):
+        for n in range(len(top)):
             # A hundredth: within a tenth of its deviation nothing but the mode itself attracts.
             if _square(x, top[n], curvature[n]) < 0.01:
                 return x, matrix, n

@@ -128,7 +128,8 @@ def log_integrals(columns: Any, log_volume: Any, log_range: Any, det: Any, out: 
     """
     dimension = dimension_of(columns)
     first = triangle(dimension)
-    det[:] = 1.0
+    for n in range(len(det)):
+        det[n] = 1.0
     for size in range(dimension, 3, -1):
         integrate_last(columns, size, log_range, det, out)
     xx, yx, yy, zx, zy, zz = columns[0], columns[1], columns[2], columns[3], columns[4], columns[5]
@@ -164,8 +165,9 @@ def invert_all(matrices: Any, size: Any, det: Any) -> None:
         Of the matrices.
     det : ndarray of shape (n,)
     """
-    det[:] = 1.0
     inverse = np.empty(len(det))
+    for n in range(len(det)):
+        det[n] = 1.0
     # The sweep operator: J. H. Goodnight, "A tutorial on the SWEEP operator", The American Statistician 33 (3), 1979.
     for p in range(size):
         pivot = matrices[triangle(p) + p]

@@ -20,6 +20,13 @@ def is_free(free: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
+def is_free_place(free: Any, origin: Any, voxel_size: Any, place: Any) -> Any:
+    """Whether a place of shape (3,), m, lies in a free voxel."""
+    x, y, z = place[0] - origin[0], place[1] - origin[1], place[2] - origin[2]
+    return is_free(free, x / voxel_size, y / voxel_size, z / voxel_size)
+
+
+@numba.njit(cache=True, nogil=True)
 def nearest_free(position: Any, cov: Any, reach: Any, origin: Any, voxel_size: Any, free: Any) -> Any:
     """Move a position, in place, to the nearest one in the free space; False when there is none within reach.
 
@@ -42,7 +49,7 @@ def nearest_free(position: Any, cov: Any, reach: Any, origin: Any, voxel_size: A
         first[i] = max(0, int(np.floor((position[i] - far - origin[i]) / voxel_size)))
         stop[i] = min(free.shape[i], int(np.floor((position[i] + far - origin[i]) / voxel_size)) + 1)
     least = np.inf
-    best, apart = np.empty(3), np.empty(3)
+    apart, best = np.empty(3), np.empty(3)
     # Just inside the voxels: their faces may be another's.
     inside = 1e-6 * voxel_size
     for x in range(first[0], stop[0]):
@@ -59,8 +66,10 @@ def nearest_free(position: Any, cov: Any, reach: Any, origin: Any, voxel_size: A
                         square += apart[i] * precision[i, j] * apart[j]
                 if square < least:
                     least = square
-                    best[:] = apart
+                    for i in range(3):
+                        best[i] = apart[i]
     if least == np.inf:
         return False
-    position += best
+    for i in range(3):
+        position[i] += best[i]
     return True
