@@ -61,6 +61,17 @@ def test_fusion(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monke
 
 
 @pytest.mark.slow
+def test_exhaustive(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ["--table", str(hall_table_path), "--reports", "33", "--products", "500"]
+    rows = [line.rsplit(maxsplit=9) for line in run("exhaustive.py", capsys, monkeypatch, *arguments)[4:]]
+    assert len({label for label, *_ in rows}) == len(rows) == 11
+    for _, *figures in rows:
+        for half, most in zip(figures[::3], figures[2::3], strict=True):
+            assert 0.0 <= float(half) <= float(most)
+        assert float(figures[0]) < 0.05
+
+
+@pytest.mark.slow
 def test_uwb(
     shared_data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
