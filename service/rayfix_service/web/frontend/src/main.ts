@@ -56,7 +56,6 @@ async function start(): Promise<void> {
   const layout = buildLayout(root);
   const status = new StatusScreen(root);
   status.loading("Loading the scene …");
-  performance.mark("rayfix-start");
   let stage: Stage;
   try {
     stage = new Stage(layout.canvas, layout.labels);
@@ -74,15 +73,13 @@ async function start(): Promise<void> {
     status.done();
     return;
   }
-  performance.mark("rayfix-stage");
   const api = new Api();
   const [site, mesh, tables] = await load(api, status);
-  performance.mark("rayfix-data");
   const viewer = new Viewer(layout, stage, site, mesh, api);
-  performance.mark("rayfix-viewer");
   viewer.offerTables(tables);
   window.rayfixViewer = viewer;
   status.done();
+  performance.mark("rayfix-ready");
   void api.listen(
     (event) => viewer.store.add(event),
     (state) => viewer.streamState(state),

@@ -24,7 +24,8 @@ import { Labels } from "./labels";
 export type ViewName = "orbit" | "plan" | "side";
 
 const SLOW_FRAME = 55; // ms; beyond, the picture gets coarser while it moves
-const COARSEST = 0.5;
+const SLOW_RUN = 6; // frames in a row; the first ones of a drawing are slow by nature
+const COARSEST = 0.6;
 const SETTLED = 250; // ms after the last change, it is drawn finely again
 const KEPT_FRAMES = 600;
 const FOCUS = 0.3; // of the building's extent, when one place is looked at
@@ -56,7 +57,8 @@ export class Stage {
   private dirty = true;
   private running = false;
   private lastFrame = 0;
-  private smoothed = 16;
+  private slow = 0;
+  private untouched = true;
   private coarseness = 1;
   private settle = 0;
 
@@ -77,6 +79,7 @@ export class Stage {
     this.controls.zoomToCursor = true;
     this.controls.maxPolarAngle = Math.PI * 0.98;
     this.controls.addEventListener("change", () => this.invalidate());
+    this.controls.addEventListener("start", () => (this.untouched = false));
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement!);
     theme.onChange(() => this.paint());
     this.paint();
@@ -97,6 +100,8 @@ export class Stage {
   setInsets(insets: { left: number; right: number; top: number; bottom: number }): void {
     this.insets = insets;
     this.resize();
+    // Who has moved the camera keeps it where it is.
+    if (this.untouched) this.show(this.view);
   }
 
   invalidate(): void {
@@ -131,10 +136,10 @@ export class Stage {
   private measure(duration: number): void {
     this.frameTimes.push(duration);
     if (this.frameTimes.length > KEPT_FRAMES) this.frameTimes.shift();
-    this.smoothed += 0.15 * (Math.min(duration, 500) - this.smoothed);
-    if (this.smoothed > SLOW_FRAME && this.coarseness > COARSEST) {
+    this.slow = duration > SLOW_FRAME ? this.slow + 1 : 0;
+    if (this.slow > SLOW_RUN && this.coarseness > COARSEST) {
       this.coarsen(Math.max(COARSEST, this.coarseness * 0.8));
-      this.smoothed = SLOW_FRAME * 0.7;
+      this.slow = 0;
     }
   }
 
@@ -194,6 +199,7 @@ export class Stage {
   /** Look at all of the building from a side, from above, or obliquely. */
   show(view: ViewName): void {
     this.view = view;
+    this.untouched = true;
     const extent = this.bounds.getSize(new Vector3());
     const middle = this.bounds.getCenter(new Vector3());
     // The longer side runs to the right.
@@ -247,6 +253,7 @@ export class Stage {
 
   /** Look at a place from nearby, without turning. */
   focus(place: Vector3): void {
+    this.untouched = false;
     const offset = this.camera.position.clone().sub(this.controls.target);
     const near = FOCUS * this.bounds.getSize(new Vector3()).length();
     if (this.camera instanceof PerspectiveCamera) offset.setLength(Math.min(offset.length(), near));

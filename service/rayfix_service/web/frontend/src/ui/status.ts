@@ -53,6 +53,7 @@ export class StatusScreen {
 
   done(): void {
     this.element.hidden = true;
+    document.documentElement.dataset["ready"] = "";
   }
 }
 

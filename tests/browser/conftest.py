@@ -1,0 +1,142 @@
+"""A real browser on a real service. The tests skip where there is no Chromium or the viewer is not built."""
+
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from rayfix_service.web.assets import load_assets
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+ARTEFACTS = Path(__file__).resolve().parents[2] / "browser-artefacts"
+
+FLAGS = [
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",  # WebGL in software
+    "--enable-unsafe-swiftshader",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+
+
+class Service:
+    """``rayfix serve`` in a process of its own, on a free port."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        command = [sys.executable, "-m", "rayfix", "serve", *map(str, arguments), "--port", "0"]
+        self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        self.log: list[str] = []
+        self._listening = threading.Event()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.log.append(line)
+            if "running on http://" in line:
+                self._listening.set()
+
+    def url(self) -> str:
+        """Address, once it is ready."""
+        assert self._listening.wait(60), "".join(self.log)
+        url = next(found for line in self.log for found in re.findall(r"http://127\.0\.0\.1:\d+", line))
+        deadline = time.monotonic() + 120
+        while httpx.get(f"{url}/readyz", trust_env=False, timeout=10).status_code != 200:
+            assert time.monotonic() < deadline, "".join(self.log)
+            time.sleep(0.1)
+        return url
+
+    def stop(self) -> None:
+        """End it."""
+        self.process.send_signal(signal.SIGTERM)
+        try:
+            self.process.wait(20)
+        finally:
+            self.process.kill()
+            self._reader.join(10)
+            assert self.process.stderr is not None
+            self.process.stderr.close()
+
+
+@pytest.fixture(scope="session")
+def serve() -> Callable[..., Any]:
+    """Return the context that serves a table and gives the address."""
+
+    @contextmanager
+    def serving(*arguments: str | Path) -> Iterator[str]:
+        service = Service(*arguments)
+        try:
+            yield service.url()
+        finally:
+            service.stop()
+
+    return serving
+
+
+@pytest.fixture(scope="session")
+def artefacts() -> Path:
+    """Folder of screenshots and figures, to be looked at."""
+    ARTEFACTS.mkdir(exist_ok=True)
+    return ARTEFACTS
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Return Chromium as the system has it."""
+    executable = next((found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None)
+    if executable is None:
+        pytest.skip("there is no Chromium; install the package chromium")
+    if not load_assets():
+        pytest.skip("the viewer is not built; run make viewer")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=executable, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="session")
+def hall_url(hall_table_path: Path, browser: Any, serve: Callable[..., Any]) -> Iterator[str]:
+    """Address of a service of the small table of the hall."""
+    with serve(hall_table_path) as url:
+        yield url
+
+
+@pytest.fixture
+def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
+    """Return what opens the viewer; at the end no page may have logged an error or asked anyone else for anything."""
+    pages: list[tuple[Any, str, list[str], list[str]]] = []
+
+    def open_viewer(url: str, *, size: tuple[int, int] = (1280, 720), scheme: str = "dark", ready: bool = True) -> Any:
+        page = browser.new_page(viewport={"width": size[0], "height": size[1]}, color_scheme=scheme)
+        errors: list[str] = []
+        requests: list[str] = []
+        page.on("console", lambda m: errors.append(m.text) if m.type in ("error", "warning") else None)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("request", lambda request: requests.append(request.url))
+        pages.append((page, url, errors, requests))
+        page.goto(url)
+        if ready:
+            page.wait_for_selector("html[data-ready]")
+        return page
+
+    yield open_viewer
+    for page, url, errors, requests in pages:
+        page.close()
+        assert errors == []
+        origin = url.split("#")[0].rstrip("/")
+        assert [r for r in requests if not r.startswith((origin, "data:"))] == []
