@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from rayfix.cli_pictures import add_picture_commands
 from rayfix.extras import needs_extra
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.version import software_version
@@ -110,6 +111,8 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--seed", type=int, default=1, help="of places and noise (default: 1)")
     plan.add_argument("--no-progress", action="store_true", help="show no progress bar")
     plan.add_argument("--json", action="store_true", help="print the map as JSON, one line for each table")
+
+    add_picture_commands(add)
 
     serve = add("serve", _serve, "serve a table, or all tables of a folder, over HTTP")
     serve.add_argument("tables", type=Path, metavar="T.h5|DIR")

@@ -14,10 +14,11 @@ from rayfix_service.http.problems import (
     ProblemError,
     problem_responses,
 )
-from rayfix_service.http.tables import Change, ServedTable
+from rayfix_service.http.tables import Change
 from rayfix_service.wire import FieldProblem, Point
 from rayfix_tables.level import Level
 from rayfix_tables.site import Station
+from rayfix_tables.table import Table
 
 router = APIRouter(prefix="/v1", tags=["table"])
 
@@ -99,13 +100,13 @@ _ONE_TABLE = problem_responses(INVALID_PARAMETER, NOT_FOUND, NOT_READY)
 @router.get("/table", summary="The table", responses=_ONE_TABLE)
 async def get_table(table: TableDep) -> TableSummary:
     """Tell which table answers, and which site it was built for."""
-    return _table(table)
+    return table_summary(table.name, table.locator.table)
 
 
 @router.get("/tables", summary="All tables", responses=problem_responses(NOT_READY))
 async def get_tables(tables: TablesDep) -> TableList:
     """List the tables that answer."""
-    return TableList(tables=[_table(table) for table in tables.all()])
+    return TableList(tables=[table_summary(table.name, table.locator.table) for table in tables.all()])
 
 
 @router.post("/tables/reload", summary="Load new tables", responses=problem_responses(TABLE_REFUSED))
@@ -130,14 +131,14 @@ async def post_reload(tables: TablesDep) -> Reloaded:
 async def get_stations(served: TableDep) -> StationList:
     """List the stations that reports may name, with their levels in the table."""
     table = served.locator.table
-    return StationList(stations=[_station(s, table.levels(s.id)) for s in table.site.stations])
+    return StationList(stations=[station_summary(s, table.levels(s.id)) for s in table.site.stations])
 
 
-def _table(served: ServedTable) -> TableSummary:
-    table = served.locator.table
+def table_summary(name: str, table: Table) -> TableSummary:
+    """Describe a table."""
     stations = table.site.stations
     return TableSummary(
-        name=served.name,
+        name=name,
         table_id=table.table_id,
         format_version=table.format_version,
         software_version=table.software_version,
@@ -151,7 +152,8 @@ def _table(served: ServedTable) -> TableSummary:
     )
 
 
-def _station(station: Station, levels: tuple[Level, ...]) -> StationSummary:
+def station_summary(station: Station, levels: tuple[Level, ...]) -> StationSummary:
+    """Describe a station and its levels."""
     x, y, z = station.position
     bearing, downtilt, slant = (_degrees(angle) for angle in station.orientation)
     return StationSummary(

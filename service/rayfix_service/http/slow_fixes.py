@@ -8,6 +8,7 @@ from typing import TypeVar
 from rayfix_service.fusion.report import Angle, Report
 from rayfix_service.http.problems import FIX_TIMEOUT, OVERLOADED, ProblemError
 
+Asked = TypeVar("Asked")
 T = TypeVar("T")
 
 _MEASUREMENTS_ON_LOOP = 16
@@ -42,8 +43,8 @@ class SlowFixes:
         self._seconds = seconds
         self._under_way = 0
 
-    async def locate(self, locate: Callable[[Report], T], report: Report) -> T:
-        """Locate a report in a thread.
+    async def locate(self, locate: Callable[[Asked], T], report: Asked) -> T:
+        """Locate a report in a thread, or do what takes as long with something else that was asked.
 
         Raises
         ------

@@ -1,6 +1,6 @@
 """Routes that make reports and show whole posteriors."""
 
-import asyncio
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -21,6 +21,7 @@ from rayfix_service.http.problems import (
     ProblemError,
     problem_responses,
 )
+from rayfix_service.http.slow_fixes import SlowFixes
 from rayfix_service.web.documents import (
     PosteriorDocument,
     SimulationDocument,
@@ -74,7 +75,8 @@ async def post_simulation(request: Request, served: TableDep, body: ReportBody) 
             FORBIDDEN, "this service does not simulate; start it with --allow-simulation, or listen on loopback"
         )
     wanted = parse_simulation(body)
-    return JSONResponse(await asyncio.to_thread(_simulate_and_locate, served.locator, wanted))
+    slow_fixes: SlowFixes = request.app.state.slow_fixes
+    return JSONResponse(await slow_fixes.locate(partial(_simulate_and_locate, served.locator), wanted))
 
 
 @router.post(
@@ -84,9 +86,10 @@ async def post_simulation(request: Request, served: TableDep, body: ReportBody) 
     responses=POSITION_PROBLEMS,
     openapi_extra=request_body(ReportDocument, REPORT_EXAMPLES),
 )
-async def post_posterior(served: TableDep, body: ReportBody) -> JSONResponse:
+async def post_posterior(request: Request, served: TableDep, body: ReportBody) -> JSONResponse:
     """Give the Gaussians of the posterior and positions drawn from it, for pictures."""
-    return JSONResponse(await asyncio.to_thread(picture_posterior, served.locator, parse_report(body)))
+    slow_fixes: SlowFixes = request.app.state.slow_fixes
+    return JSONResponse(await slow_fixes.locate(partial(picture_posterior, served.locator), parse_report(body)))
 
 
 def viewer_settings(table: Table, *, simulation: bool) -> ViewerSettings:

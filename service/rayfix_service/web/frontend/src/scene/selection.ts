@@ -22,7 +22,7 @@ export interface Shown {
 export class Selection {
   readonly group = new Group();
   readonly shown: Shown = { paths: true, rivals: true, cloud: true };
-  private readonly cloud = new Dots({ opacity: 0.5 });
+  private readonly cloud = new Dots({ opacity: 0.45, throughWalls: true });
   private readonly dots = new Dots({ rim: 0.25, throughWalls: true });
   private ellipsoids: Ellipsoid[] = [];
   private lines: Line2[] = [];

@@ -28,7 +28,7 @@ const SLOW_RUN = 6; // frames in a row; the first ones of a drawing are slow by 
 const COARSEST = 0.6;
 const SETTLED = 250; // ms after the last change, it is drawn finely again
 const KEPT_FRAMES = 600;
-const FOCUS = 0.3; // of the building's extent, when one place is looked at
+const FOCUS = 0.42; // of the building's extent, when one place is looked at
 
 /** Constant of a section that cuts nothing; an infinite one would be no number on the graphics card. */
 export const UNCUT = 1e6;

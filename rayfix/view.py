@@ -1,0 +1,158 @@
+"""``rayfix view``: the viewer with a site and its fixes in one file, which needs no service."""
+
+import base64
+import hashlib
+import html
+import json
+import re
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rayfix_service.fusion.locator import Locator
+from rayfix_service.http.routes_table import station_summary, table_summary
+from rayfix_service.web.assets import INDEX, STATIC
+from rayfix_service.web.glb import write_glb
+from rayfix_service.web.routes_simulation import picture_posterior, viewer_settings
+from rayfix_service.wire import InvalidReportError, fix_to_document, parse_report, read_json
+from rayfix_tables.errors import RayfixError, ReportError
+from rayfix_tables.table import Table
+
+
+class ViewError(RayfixError):
+    """The page cannot be written."""
+
+
+def write_view(table_path: Path, output: Path, report_path: Path | None = None) -> int:
+    """Write a page that shows a site and the fixes of a file's reports.
+
+    Parameters
+    ----------
+    table_path : pathlib.Path
+    output : pathlib.Path
+        The page, HTML.
+    report_path : pathlib.Path, optional
+        A report as ``POST /v1/positions`` takes it, or several in ``{"reports": [...]}``.
+
+    Returns
+    -------
+    int
+        Number of fixes in the page.
+
+    Raises
+    ------
+    TableError
+        When the table cannot be used.
+    ReportError
+        When a report cannot be read or used.
+    ViewError
+        When the viewer is not built, or the page cannot be written.
+    """
+    table = Table.open(table_path)
+    locator = Locator(table)
+    if report_path is not None:
+        locator.warm_up()  # else the first fix would tell how long compiling takes
+    events = [] if report_path is None else [_event(locator, document) for document in read_reports(report_path)]
+    page = render_view(table_path.stem, table, events)
+    try:
+        output.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise ViewError(f"{output} cannot be written ({error.strerror}); give another file") from error
+    return len(events)
+
+
+def read_reports(path: Path) -> list[Mapping[str, Any]]:
+    """Read the report of a file, or its ``{"reports": [...]}``.
+
+    Raises
+    ------
+    ReportError
+        When there is none; the message names the file.
+    """
+    try:
+        document = read_json(path.read_bytes())
+    except OSError as error:
+        raise ReportError(f"{path} cannot be read ({error.strerror}); give a file with a report") from error
+    except ReportError as error:
+        raise ReportError(f"{path}: {error}", path=error.path) from error
+    documents = document["reports"] if isinstance(document, dict) and "reports" in document else [document]
+    if not isinstance(documents, list) or not all(isinstance(one, dict) for one in documents):
+        raise ReportError(f'{path} is no report; give {{"measurements": [...]}} or {{"reports": [...]}}')
+    return documents
+
+
+def render_view(name: str, table: Table, events: list[dict[str, Any]]) -> str:
+    """Write the page as text.
+
+    Parameters
+    ----------
+    name : str
+        Of the table.
+    table : Table
+    events : list of dict
+        Reports with their fixes, as the viewer takes them.
+
+    Raises
+    ------
+    ViewError
+        When the viewer is not built.
+    """
+    data = {
+        "table": table_summary(name, table).model_dump(mode="json"),
+        "stations": [
+            station_summary(station, table.levels(station.id)).model_dump(mode="json")
+            for station in table.site.stations
+        ],
+        "settings": viewer_settings(table, simulation=False).model_dump(mode="json"),
+        "scene_base64": base64.b64encode(write_glb(table.scene, table.site.name)).decode(),
+        "events": events,
+    }
+    return inline(STATIC, data, title=f"rayfix · {table.site.name}")
+
+
+def inline(static: Path, data: Mapping[str, Any], *, title: str) -> str:
+    """Put the built viewer and data into one page, whose policy allows its own script and style and nothing else."""
+    if not (static / INDEX).is_file():
+        raise ViewError(
+            "the viewer is not built; run 'make viewer' in the checkout, or install a package, which has it"
+        )
+    page = (static / INDEX).read_text(encoding="utf-8")
+    script = _only(static, "*.js").replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    style = _only(static, "*.css")
+    policy = (
+        f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    head = (
+        f'<meta http-equiv="Content-Security-Policy" content="{html.escape(policy)}">'
+        f"<title>{html.escape(title)}</title><style>{style}</style>"
+    )
+    # Within a script element no "<" may begin a tag.
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    body = f'<script type="application/json" id="rayfix-data">{text}</script><script type="module">{script}</script>'
+    page = re.sub(r"\s*<script\b[^>]*></script>|\s*<link rel=\"stylesheet\"[^>]*>|\s*<title>.*?</title>", "", page)
+    page = page.replace("</head>", f"{head}\n  </head>", 1)
+    return page.replace("</body>", f"{body}\n  </body>", 1)
+
+
+def _event(locator: Locator, document: Mapping[str, Any]) -> dict[str, Any]:
+    try:
+        report = parse_report(document)
+    except InvalidReportError as error:
+        raise ReportError(f"the report cannot be used: {error}", path=error.path) from error
+    begin = time.perf_counter()
+    fix = locator.locate(report)
+    event = {"report": document, "fix": fix_to_document(fix, time.perf_counter() - begin), "source": "file"}
+    if fix.position is not None:
+        event["posterior"] = picture_posterior(locator, report)
+    return event
+
+
+def _only(static: Path, pattern: str) -> str:
+    (path,) = (static / "assets").glob(pattern)
+    return path.read_text(encoding="utf-8")
+
+
+def _digest(text: str) -> str:
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
