@@ -10,18 +10,24 @@ $(VENV)/.done: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
-# The viewer's files, which the service gives at / and packages hold. Where there is no npm, the service does without.
+# The viewer's files, which the service gives at / and packages hold. Where they cannot be built, the service does without.
+CAN_BUILD_VIEWER = command -v npm >/dev/null && node -e \
+	'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 20 || (a === 20 && b >= 19) ? 0 : 1)'
 FRONTEND := service/rayfix_service/web/frontend
 VIEWER := service/rayfix_service/web/static/index.html
 
 viewer: $(VIEWER)
 
 $(VIEWER): $(wildcard $(FRONTEND)/*.*) $(shell find $(FRONTEND)/src -type f)
-	@if command -v npm >/dev/null; then \
+	@if $(CAN_BUILD_VIEWER); then \
 		cd $(FRONTEND) && npm ci --no-progress && npm run build; \
 	else \
-		echo "there is no npm: the viewer is not built; install Node.js 20.19 or later"; \
+		echo "the viewer is not built: it needs npm and Node.js 20.19 or later"; \
 	fi
+
+# The documentation's pictures, of the demo's table.
+screenshots: demo viewer
+	$(BIN)/python -m pytest tests/browser/screenshots.py
 
 demo: $(VENV)/.done
 	$(BIN)/rayfix demo --output demo

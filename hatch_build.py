@@ -19,12 +19,20 @@ class ViewerBuildHook(BuildHookInterface):
         root = Path(self.root)
         if version == "editable" or is_fresh(root):
             return
-        npm = shutil.which("npm")
-        if npm is None:
-            self.app.display_warning("there is no npm: the package will be without the viewer")
+        if not can_build():
+            self.app.display_warning("no npm with Node.js 20.19 or later: the package will be without the viewer")
             return
-        for command in (["ci"], ["run", "build"]):
-            subprocess.run([npm, *command], cwd=root / FRONTEND, check=True)
+        for command in (["npm", "ci"], ["npm", "run", "build"]):
+            subprocess.run(command, cwd=root / FRONTEND, check=True)
+
+
+def can_build() -> bool:
+    """Whether there is an npm whose Node.js is new enough for Vite."""
+    if shutil.which("npm") is None or shutil.which("node") is None:
+        return False
+    version = subprocess.run(["node", "--version"], capture_output=True, text=True, check=True).stdout
+    major, minor = version.strip().removeprefix("v").split(".")[:2]
+    return (int(major), int(minor)) >= (20, 19)
 
 
 def is_fresh(root: Path) -> bool:

@@ -7,7 +7,6 @@ alone it answers a report from the demo's table, and neither trimesh nor scikit-
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -65,8 +64,8 @@ def check_viewer(folder: Path, python: Path) -> None:
     answer = run(folder, python, "-c", PAGE).strip()
     if answer == "200 True 2 True":
         print("the wheel has the viewer")
-    elif shutil.which("npm") is None:
-        print("the wheel has NO viewer, since there is no npm here")
+    elif not (ROOT / "service" / "rayfix_service" / "web" / "static" / "index.html").is_file():
+        print("the wheel has NO viewer, since it could not be built here; 'make viewer' says why")
     else:
         sys.exit(f"the wheel's viewer is not whole: {answer}")
 

@@ -25,7 +25,7 @@ const PALETTES: Record<Theme, Palette> = {
     background: 0x10141a,
     edges: 0x8fa3bd,
     edgeOpacity: 0.34,
-    tint: [0.52, 0.58, 0.68],
+    tint: [0.6, 0.67, 0.79],
     floor: 0x1c232d,
     ink: 0xe7ebf1,
     fix: 0xff5c77,

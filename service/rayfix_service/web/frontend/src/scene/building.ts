@@ -155,7 +155,9 @@ function split(positions: Float32Array, indices: Uint32Array, bounds: Box3): Map
       return most < min[axis] + slack || least > max[axis] - slack;
     });
     let part: Part = "objects";
-    if (!upright && low > min.z + 0.88 * extent.z) part = "ceiling";
+    // A roof may slope; what is level right below the ceiling is the top of something tall.
+    const overhead = Math.abs(normal.z) > 0.95 ? 0.97 : 0.8;
+    if (!upright && low > min.z + overhead * extent.z) part = "ceiling";
     else if (!upright && high < min.z + 0.03 * extent.z) part = "floor";
     else if (upright && (onSide || (high - low > 0.9 * extent.z && wide(a, b, c) > WALL * Math.max(extent.x, extent.y)))) part = "walls";
     const list = lists.get(part) ?? [];
