@@ -128,5 +128,5 @@ def test_a_warehouse_with_twenty_live_targets_stays_responsive(
     print(json.dumps(figures, indent=2))
     # A busy machine is slower than that; a viewer that does not keep up stands still.
     assert np.all(np.array(counts) > before)
-    assert figures["frame, median, ms"] < 250.0
+    assert figures["frame, median, ms"] < 1000.0
     assert min(clicks) < 3.0

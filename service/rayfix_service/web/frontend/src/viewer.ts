@@ -121,7 +121,10 @@ export class Viewer {
     this.listenToPointer(layout.canvas);
     this.listenToDrops();
 
-    this.store.onFix((target) => target === this.store.selected && this.refresh());
+    this.store.onFix((target) => {
+      this.stale ||= target === this.store.selected;
+      if (this.stale) stage.invalidateLater();
+    });
     this.store.onSelect(() => this.refresh());
     theme.onChange(() => this.describe());
     stage.onFrame(() => this.stale && this.explain());

@@ -1,13 +1,12 @@
 /** What the table inspector draws: the mixture of a direction, and the ray that it is of. */
 
 import { Group } from "three";
-import type { Line2 } from "three/addons/lines/Line2.js";
 
 import { DEG, direction, vec } from "../numeric";
 import { theme } from "../theme";
 import type { Mirrors } from "../trace/mirrors";
 import type { MixtureView, Site } from "../types";
-import { Dots, Ellipsoid, disposeLine, fatLine, type Dot } from "./shapes";
+import { Dots, Ellipsoids, FatLines, type Dot, type FatLine, type Shell } from "./shapes";
 import type { Stage } from "./stage";
 
 const MOST = 48; // ellipsoids; the rest are dots
@@ -21,9 +20,9 @@ export interface Aim {
 
 export class Mixture {
   readonly group = new Group();
-  private readonly ellipsoids: Ellipsoid[] = [];
+  private readonly ellipsoids = new Ellipsoids();
   private readonly dots = new Dots({ rim: 0.25, throughWalls: true });
-  private lines: Line2[] = [];
+  private readonly lines = new FatLines();
   private last: [MixtureView | null, Aim] | null = null;
 
   constructor(
@@ -31,7 +30,7 @@ export class Mixture {
     private readonly site: Site,
     private readonly mirrors: Mirrors,
   ) {
-    this.group.add(this.dots);
+    this.group.add(this.dots, this.ellipsoids, this.lines);
     this.group.visible = false;
     theme.onChange(() => this.last && this.show(...this.last));
   }
@@ -41,49 +40,36 @@ export class Mixture {
     this.drawRay(aim);
     const components = view?.components ?? [];
     const dots: Dot[] = [];
+    const shells: Shell[] = [];
     const most = Math.max(...components.map((c) => c.probability), 1e-12);
     components.forEach((component, n) => {
-      const at = this.stage.local(vec(component.position));
+      const mean = this.stage.local(vec(component.position));
       const colour = theme.reflections(component.num_reflections);
       const share = Math.sqrt(component.probability / most);
-      dots.push({ position: at, colour, diameter: 4 + 7 * share });
-      if (n >= MOST) return;
-      const ellipsoid = this.ellipsoids[n] ?? this.addEllipsoid();
-      ellipsoid.visible = true;
-      ellipsoid.place(at, component.covariance_m2, 1.5);
-      ellipsoid.paint(colour, 0.05 + 0.75 * share);
+      dots.push({ position: mean, colour, diameter: 4 + 7 * share });
+      const opacity = 0.05 + 0.75 * share;
+      const covariance = component.covariance_m2;
+      if (n < MOST) shells.push({ mean, covariance, sigmas: 1.5, colour, opacity, throughWalls: false });
     });
-    for (let n = Math.min(components.length, MOST); n < this.ellipsoids.length; n++) this.ellipsoids[n]!.visible = false;
+    this.ellipsoids.set(shells);
     this.dots.setRim(theme.palette.background);
     this.dots.set(dots);
     this.stage.invalidate();
   }
 
-  private addEllipsoid(): Ellipsoid {
-    const ellipsoid = new Ellipsoid();
-    this.ellipsoids.push(ellipsoid);
-    this.group.add(ellipsoid);
-    return ellipsoid;
-  }
-
   /** The ray of the measured direction itself, a colour for each number of reflections. */
   private drawRay(aim: Aim): void {
-    for (const line of this.lines) {
-      this.group.remove(line);
-      disposeLine(line);
-    }
-    this.lines = [];
     const station = this.site.stations.find((s) => s.id === aim.stationId);
     if (station === undefined) return;
     const { max_reflections } = this.site.settings;
     const towards = direction(aim.azimuthDeg * DEG, aim.zenithDeg * DEG);
     const most = this.site.table.site.max_path_length_m;
     const { points } = this.mirrors.follow(vec(station.position), towards, max_reflections, most);
+    const lines: FatLine[] = [];
     for (let n = 0; n + 1 < points.length; n++) {
       const piece = [this.stage.local(points[n]!), this.stage.local(points[n + 1]!)];
-      const line = fatLine(piece, theme.reflections(n), { width: 2, opacity: 0.8, throughWalls: true });
-      this.lines.push(line);
-      this.group.add(line);
+      lines.push({ points: piece, colour: theme.reflections(n), width: 2, opacity: 0.8, throughWalls: true });
     }
+    this.lines.set(lines);
   }
 }

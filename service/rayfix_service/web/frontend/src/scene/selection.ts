@@ -1,14 +1,13 @@
 /** The selected fix: where it may be, its rivals, and the paths that explain it. */
 
-import { Group, Vector3 } from "three";
-import type { Line2 } from "three/addons/lines/Line2.js";
+import { Group } from "three";
 
 import { vec } from "../numeric";
 import type { ExplainedFix } from "../residuals";
 import { theme } from "../theme";
 import type { FixEvent, Posterior, Vec3 } from "../types";
 import type { Label } from "./labels";
-import { Dots, Ellipsoid, disposeLine, fatLine, type Dot } from "./shapes";
+import { Dots, Ellipsoids, FatLines, type Dot, type FatLine, type Shell } from "./shapes";
 import type { Stage } from "./stage";
 
 export const SIGMAS = 2;
@@ -24,15 +23,15 @@ export class Selection {
   readonly shown: Shown = { paths: true, rivals: true, cloud: true };
   private readonly cloud = new Dots({ opacity: 0.45, throughWalls: true });
   private readonly dots = new Dots({ rim: 0.25, throughWalls: true });
-  private ellipsoids: Ellipsoid[] = [];
-  private lines: Line2[] = [];
+  private readonly ellipsoids = new Ellipsoids();
+  private readonly lines = new FatLines();
   private labels: Label[] = [];
   private event: FixEvent | null = null;
   private explained: ExplainedFix | null = null;
   private posterior: Posterior | null = null;
 
   constructor(private readonly stage: Stage) {
-    this.group.add(this.cloud, this.dots);
+    this.group.add(this.cloud, this.dots, this.ellipsoids, this.lines);
     theme.onChange(() => this.draw());
   }
 
@@ -49,7 +48,9 @@ export class Selection {
   }
 
   draw(): void {
-    this.clear();
+    for (const label of this.labels) this.stage.labels.remove(label);
+    this.labels = [];
+    const shells: Shell[] = [];
     const { event, stage } = this;
     const { palette } = theme;
     const dots: Dot[] = [];
@@ -59,7 +60,13 @@ export class Selection {
         const at = stage.local(vec(candidate.position));
         const colour = n === 0 ? palette.fix : palette.rival;
         const strength = n === 0 ? 0.75 : 0.2 + 0.45 * candidate.probability;
-        this.addEllipsoid(at, candidate.covariance_m2, colour, strength);
+        // Seen through walls faintly, and fully where nothing is before it.
+        for (const [throughWalls, opacity] of [
+          [true, 0.35 * strength],
+          [false, strength],
+        ] as const) {
+          shells.push({ mean: at, covariance: candidate.covariance_m2, sigmas: SIGMAS, colour, opacity, throughWalls });
+        }
         if (n > 0) {
           dots.push({ position: at, colour, diameter: 8 });
           this.labels.push(stage.labels.add(percent(candidate.probability), "rival", at));
@@ -71,7 +78,8 @@ export class Selection {
         this.labels.push(stage.labels.add("truth", "truth", at));
       }
     }
-    if (this.shown.paths && this.explained !== null) this.addPaths(this.explained, dots);
+    this.ellipsoids.set(shells);
+    this.lines.set(this.shown.paths && this.explained !== null ? this.paths(this.explained, dots) : []);
     this.dots.setRim(palette.background);
     this.dots.set(dots);
     this.cloud.set(this.shown.cloud ? this.cloudDots() : []);
@@ -87,54 +95,16 @@ export class Selection {
     }));
   }
 
-  private addPaths(explained: ExplainedFix, dots: Dot[]): void {
+  private paths(explained: ExplainedFix, dots: Dot[]): FatLine[] {
+    const lines: FatLine[] = [];
     for (const path of explained.paths.values()) {
       const colour = theme.reflections(path.numReflections);
       const points = path.points.map((p) => this.stage.local(p));
-      // Seen through walls faintly, and fully where nothing is before it.
-      this.addLine(fatLine(points, colour, { width: 2.6, opacity: 0.5, throughWalls: true }));
-      this.addLine(fatLine(points, colour, { width: 3.2 }));
+      lines.push({ points, colour, width: 2.6, opacity: 0.5, throughWalls: true });
+      lines.push({ points, colour, width: 3.2, opacity: 1, throughWalls: false });
       for (const point of points.slice(1, -1)) dots.push({ position: point, colour, diameter: 9 });
     }
-  }
-
-  private addLine(line: Line2): void {
-    this.lines.push(line);
-    this.group.add(line);
-  }
-
-  private addEllipsoid(
-    at: Vector3,
-    covariance: FixEvent["fix"]["candidates"][number]["covariance_m2"],
-    colour: number,
-    strength: number,
-  ): void {
-    for (const [through, opacity] of [
-      [true, 0.35 * strength],
-      [false, strength],
-    ] as const) {
-      const ellipsoid = new Ellipsoid();
-      ellipsoid.place(at, covariance, SIGMAS);
-      ellipsoid.paint(colour, opacity);
-      ellipsoid.throughWalls(through);
-      this.ellipsoids.push(ellipsoid);
-      this.group.add(ellipsoid);
-    }
-  }
-
-  private clear(): void {
-    for (const ellipsoid of this.ellipsoids) {
-      this.group.remove(ellipsoid);
-      ellipsoid.dispose();
-    }
-    for (const line of this.lines) {
-      this.group.remove(line);
-      disposeLine(line);
-    }
-    for (const label of this.labels) this.stage.labels.remove(label);
-    this.ellipsoids = [];
-    this.lines = [];
-    this.labels = [];
+    return lines;
   }
 }
 

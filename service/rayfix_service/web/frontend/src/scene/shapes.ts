@@ -5,6 +5,7 @@ import {
   BufferGeometry,
   Color,
   DynamicDrawUsage,
+  Group,
   Matrix4,
   Mesh,
   Points,
@@ -44,7 +45,7 @@ const RIM_FRAGMENT = /* glsl */ `
   }`;
 
 /** An ellipsoid whose rim is denser than its middle, as a thin shell's would be. */
-export class Ellipsoid extends Mesh<SphereGeometry, ShaderMaterial> {
+class Ellipsoid extends Mesh<SphereGeometry, ShaderMaterial> {
   constructor() {
     super(
       SPHERE,
@@ -73,15 +74,6 @@ export class Ellipsoid extends Mesh<SphereGeometry, ShaderMaterial> {
   paint(colour: number, opacity: number): void {
     (this.material.uniforms["colour"]!.value as Color).set(colour);
     this.material.uniforms["opacity"]!.value = opacity;
-  }
-
-  /** Whether it shows through what is before it. */
-  throughWalls(through: boolean): void {
-    this.material.depthTest = !through;
-  }
-
-  override dispose(): void {
-    this.material.dispose();
   }
 }
 
@@ -177,31 +169,74 @@ export class Dots extends Points<BufferGeometry, ShaderMaterial> {
   }
 }
 
-/** A line some pixels wide. */
-export function fatLine(
-  points: readonly Vector3[],
-  colour: number,
-  options: { width: number; opacity?: number; dashed?: boolean; throughWalls?: boolean },
-): Line2 {
-  const geometry = new LineGeometry().setPositions(points.flatMap((p) => [p.x, p.y, p.z]));
-  const material = new LineMaterial({
-    color: colour,
-    linewidth: options.width,
-    opacity: options.opacity ?? 1,
-    transparent: true,
-    dashed: options.dashed ?? false,
-    dashSize: 0.18,
-    gapSize: 0.12,
-    depthTest: !options.throughWalls,
-    depthWrite: false,
-  });
-  const line = new Line2(geometry, material);
-  if (options.dashed) line.computeLineDistances();
-  line.renderOrder = options.throughWalls ? 3 : 4;
-  return line;
+export interface FatLine {
+  points: readonly Vector3[];
+  colour: number;
+  /** px */
+  width: number;
+  opacity: number;
+  /** Whether it shows through what is before it. */
+  throughWalls: boolean;
 }
 
-export function disposeLine(line: Line2): void {
-  line.geometry.dispose();
-  line.material.dispose();
+/**
+ * Lines some pixels wide. They are kept from one drawing to the next: with the last material of its kind, three.js drops
+ * the compiled shader, and compiling is what takes long.
+ */
+export class FatLines extends Group {
+  private readonly lines: Line2[] = [];
+
+  set(wanted: readonly FatLine[]): void {
+    wanted.forEach(({ points, colour, width, opacity, throughWalls }, n) => {
+      const line = this.lines[n] ?? this.append();
+      line.visible = true;
+      line.geometry.dispose();
+      line.geometry = new LineGeometry().setPositions(points.flatMap((p) => [p.x, p.y, p.z]));
+      line.material.color.set(colour);
+      line.material.linewidth = width;
+      line.material.opacity = opacity;
+      line.material.depthTest = !throughWalls;
+      line.renderOrder = throughWalls ? 3 : 4;
+    });
+    for (let n = wanted.length; n < this.lines.length; n++) this.lines[n]!.visible = false;
+  }
+
+  private append(): Line2 {
+    const line = new Line2(new LineGeometry(), new LineMaterial({ transparent: true, depthWrite: false }));
+    this.lines.push(line);
+    this.add(line);
+    return line;
+  }
+}
+
+export interface Shell {
+  mean: Vector3;
+  covariance: Matrix3;
+  sigmas: number;
+  colour: number;
+  opacity: number;
+  throughWalls: boolean;
+}
+
+/** Ellipsoids, kept from one drawing to the next for the same reason as lines. */
+export class Ellipsoids extends Group {
+  private readonly shells: Ellipsoid[] = [];
+
+  set(wanted: readonly Shell[]): void {
+    wanted.forEach((shell, n) => {
+      const ellipsoid = this.shells[n] ?? this.append();
+      ellipsoid.visible = true;
+      ellipsoid.place(shell.mean, shell.covariance, shell.sigmas);
+      ellipsoid.paint(shell.colour, shell.opacity);
+      ellipsoid.material.depthTest = !shell.throughWalls;
+    });
+    for (let n = wanted.length; n < this.shells.length; n++) this.shells[n]!.visible = false;
+  }
+
+  private append(): Ellipsoid {
+    const ellipsoid = new Ellipsoid();
+    this.shells.push(ellipsoid);
+    this.add(ellipsoid);
+    return ellipsoid;
+  }
 }

@@ -28,6 +28,8 @@ const SLOW_RUN = 6; // frames in a row; the first ones of a drawing are slow by 
 const COARSEST = 0.6;
 const SETTLED = 250; // ms after the last change, it is drawn finely again
 const KEPT_FRAMES = 600;
+const LEAST_PAUSE = 50; // ms between pictures of what a stream brings
+const MOST_PAUSE = 500;
 const FOCUS = 0.42; // of the building's extent, when one place is looked at
 
 /** Constant of a section that cuts nothing; an infinite one would be no number on the graphics card. */
@@ -58,6 +60,8 @@ export class Stage {
   private running = false;
   private lastFrame = 0;
   private slow = 0;
+  private later = 0;
+  private lastDuration = 0;
   private untouched = true;
   private coarseness = 1;
   private settle = 0;
@@ -104,7 +108,19 @@ export class Stage {
     if (this.untouched) this.show(this.view);
   }
 
+  /**
+   * Draw again soon. What a stream brings is drawn less often than what a person does, and never more than half of the
+   * time: however slow drawing is, the page goes on answering.
+   */
+  invalidateLater(): void {
+    if (this.later) return;
+    const pause = Math.min(Math.max(this.lastDuration, LEAST_PAUSE), MOST_PAUSE);
+    this.later = window.setTimeout(() => this.invalidate(), pause);
+  }
+
   invalidate(): void {
+    window.clearTimeout(this.later);
+    this.later = 0;
     this.dirty = true;
     if (this.running) return;
     this.running = true;
@@ -134,6 +150,7 @@ export class Stage {
   }
 
   private measure(duration: number): void {
+    this.lastDuration = duration;
     this.frameTimes.push(duration);
     if (this.frameTimes.length > KEPT_FRAMES) this.frameTimes.shift();
     this.slow = duration > SLOW_FRAME ? this.slow + 1 : 0;

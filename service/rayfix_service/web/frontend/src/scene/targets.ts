@@ -29,10 +29,9 @@ export class Targets {
     private readonly store: Store,
   ) {
     this.group.add(this.dots);
-    const refresh = (): void => this.refresh();
-    store.onFix(refresh);
-    store.onSelect(refresh);
-    theme.onChange(refresh);
+    store.onFix(() => this.refreshLater());
+    store.onSelect(() => this.refresh());
+    theme.onChange(() => this.refresh());
     // Twenty targets at 5 Hz are a hundred fixes a second, and fewer pictures.
     stage.onFrame(() => this.stale && this.update());
   }
@@ -40,6 +39,11 @@ export class Targets {
   refresh(): void {
     this.stale = true;
     this.stage.invalidate();
+  }
+
+  private refreshLater(): void {
+    this.stale = true;
+    this.stage.invalidateLater();
   }
 
   private update(): void {
