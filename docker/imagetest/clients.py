@@ -39,11 +39,13 @@ class Load:
     """Requests sent and what became of them."""
 
     answered: int = 0
-    refused: int = 0
-    failed: list[str] = field(default_factory=list)
     answered_after: int = 0
     """Requests that were sent before the service was told to end, and answered after."""
+    turned_away: int = 0
+    """Connections made after that: refused, or reset by the system, which had taken them for a server that ended."""
+    failed: list[str] = field(default_factory=list)
     ending: float = float("inf")
+    """When the service was told to end."""
 
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -54,7 +56,7 @@ class Load:
             connection.connect()
         except OSError:
             with self._lock:
-                self.refused += 1
+                self.turned_away += 1
             return False
         begin = time.monotonic()
         try:
@@ -70,8 +72,10 @@ class Load:
                     self.failed.append(f"{path}: status {answer.status}")
         except (OSError, http.client.HTTPException) as error:
             with self._lock:
-                after = "before" if begin < self.ending else f"{1e3 * (begin - self.ending):.0f} ms after"
-                self.failed.append(f"{path}, connected {after} SIGTERM: {error!r}")
+                if begin < self.ending:
+                    self.failed.append(f"{path}: {error!r}")
+                else:
+                    self.turned_away += 1
         finally:
             connection.close()
         return True
