@@ -69,8 +69,11 @@ def log_densities(mixture: TubeMixture, points: NDArray[np.float64]) -> tuple[ND
         ``log p(x | u)``.
     """
     u_offset = points[:, :3] - mixture.u_mean.astype(np.float64)[:, None]
-    predicted = mixture.x_mean[:, None] + u_offset @ np.swapaxes(mixture.jacobian.astype(np.float64), 1, 2)
-    log_u = mixture.log_weight[:, None] + _log_normal(u_offset, unpack(mixture.u_cov.astype(np.float64)))
+    slope, u_cov = mixture.jacobian.astype(np.float64), unpack(mixture.u_cov.astype(np.float64))
+    products = u_offset[:, :, :1] * u_offset[:, :, 1:] - u_cov[:, None, 0, 1:]
+    widening = products @ np.swapaxes(slope[:, :, 1:], 1, 2) / mixture.u_mean[:, None, :1]
+    predicted = mixture.x_mean[:, None] + u_offset @ np.swapaxes(slope, 1, 2) + widening
+    log_u = mixture.log_weight[:, None] + _log_normal(u_offset, u_cov)
     log_x = _log_normal(points[:, 3:] - predicted, unpack(mixture.x_cov.astype(np.float64)))
     joint = np.logaddexp.reduce(log_u + log_x, axis=0)
     return joint, joint - np.logaddexp.reduce(log_u, axis=0)
@@ -96,7 +99,8 @@ def log_density_as_measured(
     cross = slope @ u_cov
     cov = np.empty((len(mixture), 6, 6))
     cov[:, :3, :3], cov[:, 3:, :3], cov[:, :3, 3:] = u_cov + np.diag(noise), cross, np.swapaxes(cross, 1, 2)
-    cov[:, 3:, 3:] = unpack(mixture.x_cov.astype(np.float64)) + cross @ np.swapaxes(slope, 1, 2)
+    x_cov = unpack(mixture.x_cov.astype(np.float64)) + widening_cov(mixture.u_mean, u_cov, slope)
+    cov[:, 3:, 3:] = x_cov + cross @ np.swapaxes(slope, 1, 2)
     mean = np.concatenate([mixture.u_mean, mixture.x_mean], axis=1).astype(np.float64)
     log_parts = mixture.log_weight[:, None] + _log_normal(points - mean[:, None], cov)
     return np.asarray(np.logaddexp.reduce(log_parts, axis=0))

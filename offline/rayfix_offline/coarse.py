@@ -139,7 +139,7 @@ def _scale(weight: Any, mean: Any, noise: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _joint(k: Any, u_mean: Any, u_cov: Any, x_mean: Any, jacobian: Any, x_cov: Any, mean: Any, cov: Any) -> None:
-    """Mean and covariance of (u, x) of a stored component."""
+    """Mean and covariance of (u, x) of a stored component, with its widening."""
     place = 0
     for i in range(3):
         mean[i], mean[3 + i] = u_mean[k, i], x_mean[k, i]
@@ -159,6 +159,10 @@ def _joint(k: Any, u_mean: Any, u_cov: Any, x_mean: Any, jacobian: Any, x_cov: A
         for j in range(i, 3):
             for m in range(3):
                 cov[3 + i, 3 + j] += cov[3 + i, m] * jacobian[k, j, m]
+            for a in range(1, 3):
+                for b in range(1, 3):
+                    products = cov[0, 0] * cov[a, b] + cov[0, a] * cov[0, b]
+                    cov[3 + i, 3 + j] += products * jacobian[k, i, a] * jacobian[k, j, b] / (mean[0] * mean[0])
             cov[3 + j, 3 + i] = cov[3 + i, 3 + j]
 
 

@@ -16,7 +16,7 @@ SIZE = 6
 CUTOFF = 3.0
 """A cell gathers rays within this many standard deviations of its window."""
 
-POSITION_FLOOR = 0.005
+POSITION_FLOOR = 0.002
 """Standard deviation that every component has at least across its tube, m."""
 
 LENGTH_FLOOR = 0.05

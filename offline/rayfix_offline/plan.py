@@ -19,7 +19,7 @@ from rayfix_tables.angles import direction, local_to_scene
 from rayfix_tables.schema import FORMAT_VERSION
 from rayfix_tables.site import Station
 
-BUILD_VERSION = 3
+BUILD_VERSION = 4
 """Raised with every change of the software that makes another table of the same site."""
 
 BLOCK_CELLS = 256

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from rayfix_offline.joining import join_groups
 from rayfix_offline.merge import merge_runnalls
-from rayfix_offline.moments import blur, gather_groups, new_rows
+from rayfix_offline.moments import POSITION_FLOOR, blur, gather_groups, new_rows
 from rayfix_offline.trace import LevelRays
-from rayfix_tables.mixture import TubeMixture, pack
+from rayfix_tables.mixture import TubeMixture, pack, widening_cov
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +92,7 @@ def joint_to_tubes(
     cov: NDArray[np.float64],
     num_reflections: NDArray[np.int8],
 ) -> TubeMixture:
-    """Turn joint Gaussians over (u, x) into the table's form, u and x given u.
+    """Turn joint moments of (u, x) into the table's form, u and x given u.
 
     Parameters
     ----------
@@ -101,7 +101,11 @@ def joint_to_tubes(
     """
     u_cov = cov[:, :3, :3]
     jacobian = np.swapaxes(np.linalg.solve(u_cov, cov[:, :3, 3:]), 1, 2) if len(mean) else np.zeros((0, 3, 3))
-    x_cov = cov[:, 3:, 3:] - jacobian @ cov[:, :3, 3:]
+    x_cov = cov[:, 3:, 3:] - jacobian @ cov[:, :3, 3:] - widening_cov(mean[:, :3], u_cov, jacobian)
+    # Of components that are not quite one tube, the widening that one would have may be more than there is.
+    spread, axes = np.linalg.eigh(x_cov)
+    spread = np.maximum(spread, POSITION_FLOOR**2)
+    x_cov = (axes * spread[:, None, :]) @ axes.transpose(0, 2, 1)
     return TubeMixture(
         log_weight=log_weight,
         u_mean=mean[:, :3],

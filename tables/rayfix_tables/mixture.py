@@ -1,10 +1,16 @@
-"""Mixtures of linearised ray tubes, the content of a table's cells.
+"""Mixtures of ray tubes, the content of a table's cells.
 
-A component is a Gaussian over the ray coordinates u = (path length, horizontal angle, vertical angle), the angles in
-the cell's tangent plane, and a linear Gaussian map from u to the position x::
+A component is a Gaussian over the ray coordinates u = (path length L, angles a), the angles in the cell's tangent
+plane, and a map from u to the position x. With d = u - u_mean::
 
     u     ~ N(u_mean, u_cov)
-    x | u ~ N(x_mean + jacobian (u - u_mean), x_cov)
+    x | u ~ N(x_mean + jacobian d + widening, x_cov)
+    widening = jacobian_a (d_L d_a - u_cov_La) / L_mean
+
+A step of the angle moves the far end of a tube further than its near end, in proportion to the path length. That is the
+widening, whose mean is zero. It needs no numbers of its own: the last two columns of the jacobian are its slopes at the
+mean length. Without it, a component's x_cov would have to hold the slant that its rays take away from its middle, and
+angles much finer than the window would be believed less than they deserve.
 """
 
 from collections.abc import Sequence
@@ -44,6 +50,28 @@ def unpack(packed: NDArray[Any]) -> NDArray[Any]:
     return packed[..., _UNPACK]
 
 
+def widening_cov(u_mean: NDArray[Any], u_cov: NDArray[Any], jacobian: NDArray[Any]) -> NDArray[np.float64]:
+    """Covariance that the widening adds to the position of components.
+
+    Of Gaussian d_L and d_a, ``cov(d_L d_a) = cov_LL cov_aa + cov_La cov_aL``. The widening is not correlated with u.
+
+    Parameters
+    ----------
+    u_mean : ndarray of shape (n, 3)
+    u_cov : ndarray of shape (n, 3, 3)
+    jacobian : ndarray of shape (n, 3, 3)
+
+    Returns
+    -------
+    ndarray of shape (n, 3, 3), m2
+    """
+    u_mean, u_cov, slopes = (np.asarray(a, np.float64) for a in (u_mean, u_cov, jacobian[:, :, 1:]))
+    across = u_cov[:, 0, 1:]
+    products = u_cov[:, :1, :1] * u_cov[:, 1:, 1:] + across[:, :, None] * across[:, None, :]
+    slopes = slopes / u_mean[:, :1, None]
+    return np.asarray(slopes @ products @ slopes.transpose(0, 2, 1))
+
+
 @dataclass(frozen=True, kw_only=True)
 class TubeMixture:
     """Components of one or many cells, component axis first.
@@ -60,7 +88,7 @@ class TubeMixture:
     jacobian : ndarray of shape (n, 3, 3)
         dx / du.
     x_cov : ndarray of shape (n, 6), m2
-        Packed covariance of x given u.
+        Packed covariance of x given u, around the tube with its widening.
     num_reflections : ndarray of int8, shape (n,)
         Reflections of the path that carries most of the component.
     """

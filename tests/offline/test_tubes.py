@@ -17,7 +17,7 @@ from rayfix_offline.trace import LevelRays, trace_station
 from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_offline.twin import prepare_twin
 from rayfix_tables.angles import direction, tangent
-from rayfix_tables.mixture import TubeMixture, unpack
+from rayfix_tables.mixture import TubeMixture, unpack, widening_cov
 
 Array = NDArray[np.float64]
 STATION = np.array([3.6, 0.4, 2.6])
@@ -70,7 +70,7 @@ def joint(mixture: TubeMixture) -> tuple[Array, Array, Array]:
     cov = np.zeros((len(mixture), 6, 6))
     cov[:, :3, :3], cov[:, 3:, :3] = u_cov, cross
     cov[:, :3, 3:] = np.swapaxes(cross, 1, 2)
-    cov[:, 3:, 3:] = x_cov + cross @ np.swapaxes(slope, 1, 2)
+    cov[:, 3:, 3:] = x_cov + cross @ np.swapaxes(slope, 1, 2) + widening_cov(mixture.u_mean, u_cov, slope)
     return weight, np.concatenate([mixture.u_mean, mixture.x_mean], axis=1).astype(np.float64), cov
 
 
@@ -87,7 +87,9 @@ def log_density(mixture: TubeMixture, points: Array) -> Array:
     for k in range(len(mixture)):
         total = np.full(len(points), float(mixture.log_weight[k]) - 3.0 * np.log(2.0 * np.pi))
         off = points[:, :3] - mixture.u_mean[k]
-        rest = points[:, 3:] - mixture.x_mean[k] - off @ mixture.jacobian[k].T
+        products = off[:, :1] * off[:, 1:] - mixture.u_cov[k, 1:3]
+        widening = products @ mixture.jacobian[k, :, 1:].T / mixture.u_mean[k, 0]
+        rest = points[:, 3:] - mixture.x_mean[k] - off @ mixture.jacobian[k].T - widening
         for part, packed in ((off, mixture.u_cov[k]), (rest, mixture.x_cov[k])):
             lower = np.linalg.cholesky(unpack(packed).astype(np.float64))
             solved = np.linalg.solve(lower, part.T)

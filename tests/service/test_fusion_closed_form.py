@@ -174,17 +174,23 @@ class Product:
     def multiply_tube(self, state: Array, n: int, tube: Tube, angle: Angle | None) -> Array:
         """Multiply by a tube whose ray coordinates are the n-th of the state; returns their rows."""
         u = state[3 + 3 * n : 6 + 3 * n]
-        self.multiply(u, tube.u_mean, tube.u_cov)
-        self.multiply(state[:3] - tube.jacobian @ u, tube.x_mean - tube.jacobian @ tube.u_mean, tube.x_cov)
+        coordinates = Product(3)
+        terms = [(np.eye(3), tube.u_mean, tube.u_cov, 1.0)]
         if angle is not None:
             assert angle.zenith is not None
             assert angle.zenith_stdev is not None
             azimuth, zenith = GRID.centres[tube.cell]
             sine = np.sin(zenith)
             offset = np.array([sine * (angle.azimuth - azimuth), angle.zenith - zenith])
-            self.multiply(u[1:], offset, np.diag([sine * angle.azimuth_stdev, angle.zenith_stdev]) ** 2)
+            noise = np.diag([sine * angle.azimuth_stdev, angle.zenith_stdev]) ** 2
             # The tube has its cell's window already.
-            self.multiply(u[1:], np.zeros(2), WINDOW**2 * np.eye(2), sign=-1.0)
+            window = WINDOW**2 * np.eye(2)
+            terms += [(np.eye(3)[1:], offset, noise, 1.0), (np.eye(3)[1:], np.zeros(2), window, -1.0)]
+        for rows, value, cov, sign in terms:
+            coordinates.multiply(rows, value, cov, sign=sign)
+            self.multiply(rows @ u, value, cov, sign=sign)
+        slope, place, x_cov = straightened(tube, *coordinates.integral()[1:])
+        self.multiply(state[:3] - slope @ u, place, x_cov)
         return u
 
     def integral(self) -> tuple[float, Array, Array]:
@@ -192,6 +198,21 @@ class Product:
         cov = np.asarray(np.linalg.inv(self.information), np.float64)
         mean = cov @ self.eta
         return self.log_scale + 0.5 * (mean @ self.eta + np.linalg.slogdet(2.0 * np.pi * cov)[1]), mean, cov
+
+
+def straightened(tube: Tube, u_mean: Array, u_cov: Array) -> tuple[Array, Array, Array]:
+    """Slope, value at u = 0 and covariance of the linear map from Gaussian u that has the widening tube's moments."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(4)  # exact up to the seventh power
+    nodes = np.stack(np.meshgrid(nodes, nodes, nodes), axis=-1).reshape(-1, 3)
+    weights = np.einsum("i,j,k->ijk", weights, weights, weights).ravel() / weights.sum() ** 3
+    u = u_mean + nodes @ np.linalg.cholesky(u_cov).T
+    d = u - tube.u_mean
+    widening = (d[:, :1] * d[:, 1:] - tube.u_cov[0, 1:]) @ tube.jacobian[:, 1:].T / tube.u_mean[0]
+    x = tube.x_mean + d @ tube.jacobian.T + widening
+    middle = weights @ x
+    slope = np.linalg.solve(u_cov, (u - u_mean).T @ (weights[:, None] * (x - middle))).T
+    rest = x - middle - (u - u_mean) @ slope.T
+    return slope, middle - slope @ u_mean, tube.x_cov + rest.T @ (weights[:, None] * rest)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -376,6 +397,8 @@ def test_the_tubes_are_what_they_seem() -> None:
             length, horizontal, vertical = tube.u_mean + step
             moved = station + length * direction(azimuth + horizontal / sine, zenith + vertical)
             np.testing.assert_allclose(tube.x_mean + tube.jacobian @ step, moved, rtol=0, atol=2e-5)  # m
+        # Twice as far, a step of the angle moves twice as far: what the widening is made of.
+        assert tube.u_mean[0] == pytest.approx(np.linalg.norm(tube.x_mean - station), abs=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["aoa", "aoa+pt", "aoa+toa", "aoa+pt+toa"])

@@ -394,6 +394,8 @@ def test_closed_form_conditioning_agrees_with_sampling(seed: int, error: str) ->
     du = np.einsum("nij,nj->ni", u_root[pick], rng.standard_normal((count, 3)))
     u = mixture.u_mean[pick] + du
     x = mixture.x_mean[pick] + np.einsum("nij,nj->ni", mixture.jacobian[pick], du)
+    products = du[:, :1] * du[:, 1:] - mixture.u_cov[pick, 1:3]
+    x += np.einsum("nij,nj->ni", mixture.jacobian[pick][:, :, 1:], products) / mixture.u_mean[pick, :1]
     x += np.einsum("nij,nj->ni", x_root[pick], rng.standard_normal((count, 3)))
     # The cell's window is in the mixture already.
     off = offset - u[:, 1:]

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES, TubeMixture, pack, unpack
+from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES, TubeMixture, pack, unpack, widening_cov
 
 shapes = st.lists(st.integers(0, 3), max_size=2).map(tuple)
 seeds = st.integers(0, 2**32 - 1)
@@ -77,3 +77,23 @@ def test_stored_types(seed: int, count: int) -> None:
         assert array.flags.c_contiguous
         np.testing.assert_array_equal(array, getattr(mixture, name).astype(FIELD_DTYPES[name]))
     assert sum(getattr(stored, name).nbytes for name in FIELD_SHAPES) == count * (28 * 4 + 1)
+
+
+def test_widening_of_a_straight_tube_by_hand() -> None:
+    """Rays from the origin along +x: a step da at length L moves a place by L da, so dL da is what is not linear."""
+    u_mean = np.array([[10.0, 0.0, 0.0]])
+    u_cov = np.diag([4.0, 1e-4, 9e-4])[None]
+    jacobian = np.array([[[1.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, -10.0]]])
+    np.testing.assert_allclose(widening_cov(u_mean, u_cov, jacobian)[0], np.diag([0.0, 4e-4, 36e-4]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_widening_agrees_with_sampling(seed: int) -> None:
+    """Of a million Gaussian ray coordinates; the sample's own deviation is some thousandths."""
+    rng = np.random.default_rng(seed)
+    root = np.tril(rng.normal(size=(3, 3))) + np.diag([2.0, 1.0, 1.0])
+    jacobian, length = rng.normal(size=(3, 3)), 7.0
+    d = rng.standard_normal((1_000_000, 3)) @ root.T
+    moved = (d[:, :1] * d[:, 1:]) @ jacobian[:, 1:].T / length
+    found = widening_cov(np.array([[length, 0.0, 0.0]]), (root @ root.T)[None], jacobian[None])[0]
+    np.testing.assert_allclose(found, np.cov(moved.T), rtol=0, atol=0.01 * np.trace(found))

@@ -47,6 +47,7 @@ def condition_on_angle(
     u = np.empty(3)
     cov = np.empty((3, 3))
     cross = np.empty((3, 3))
+    slope = np.empty((3, 3))
     place = 0
     for c in range(len(begins)):
         for k in range(begins[c], ends[c]):
@@ -69,15 +70,21 @@ def condition_on_angle(
                 k2 = column1[i] * i12 + column2[i] * i22
                 for j in range(3):
                     cov[i, j] = prior[i][j] - k1 * column1[j] - k2 * column2[j]
+            # The tube widens: around the new mean it points elsewhere, and its slopes are those of another length.
+            length = np.float64(u_mean[k, 0])
+            stretch = 1.0 + u[0] / length
             for i in range(3):
                 moved = np.float64(x_mean[k, i])
+                along = np.float64(jacobian[k, i, 0])
+                for a in range(1, 3):
+                    widening = jacobian[k, i, a] / length
+                    moved += jacobian[k, i, a] * u[a] + widening * (u[0] * u[a] + cov[0, a] - prior[0][a])
+                    along += widening * u[a]
+                    slope[i, a] = jacobian[k, i, a] * stretch
+                slope[i, 0] = along
+                out_mean[place, i] = moved + jacobian[k, i, 0] * u[0]
                 for j in range(3):
-                    moved += jacobian[k, i, j] * u[j]
-                    total = 0.0
-                    for m in range(3):
-                        total += jacobian[k, i, m] * cov[m, j]
-                    cross[i, j] = total
-                out_mean[place, i] = moved
+                    cross[i, j] = along * cov[0, j] + slope[i, 1] * cov[1, j] + slope[i, 2] * cov[2, j]
             out_mean[place, 3] = u_mean[k, 0] + u[0]
             packed = 0
             for i in range(3):
@@ -85,7 +92,11 @@ def condition_on_angle(
                     total = np.float64(x_cov[k, packed])
                     packed += 1
                     for m in range(3):
-                        total += cross[i, m] * jacobian[k, j, m]
+                        total += cross[i, m] * slope[j, m]
+                    for a in range(1, 3):
+                        for b in range(1, 3):
+                            products = cov[0, 0] * cov[a, b] + cov[0, a] * cov[0, b]
+                            total += products * jacobian[k, i, a] * jacobian[k, j, b] / (length * length)
                     out_cov[place, i, j] = total
                     out_cov[place, j, i] = total
                 out_cov[place, i, 3] = cross[i, 0]

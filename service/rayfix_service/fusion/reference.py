@@ -16,7 +16,10 @@ Array = NDArray[np.float64]
 def condition_on_angle(
     components: TubeMixture, rest_mean: Array, rest_cov: Array, log_factor: float
 ) -> tuple[Array, Array, Array]:
-    """Condition the components of one cell on the rest of the measured angle, in the joint Gaussian of (u, x).
+    """Condition the components of one cell on the rest of the measured angle.
+
+    The ray coordinates u are Gaussian. The position's moments are sums over Gauss-Hermite nodes of u, which are exact for
+    the products that a widening tube makes.
 
     Parameters
     ----------
@@ -35,15 +38,24 @@ def condition_on_angle(
         Mean of (x, path length).
     cov : ndarray of shape (k, 4, 4), m2
     """
-    u_cov, jacobian = unpack(components.u_cov).astype(float), components.jacobian.astype(float)
-    across = u_cov @ jacobian.transpose(0, 2, 1)
-    joint = np.block([[u_cov, across], [across.transpose(0, 2, 1), unpack(components.x_cov) + jacobian @ across]])
-    mean = np.concatenate([components.u_mean, components.x_mean], axis=1).astype(float)
+    u_mean, u_cov = components.u_mean.astype(float), unpack(components.u_cov).astype(float)
     noise = np.array([[rest_cov[0], rest_cov[1]], [rest_cov[1], rest_cov[2]]])
-    log_likelihood, mean, joint = _condition(mean, joint, np.eye(6)[[1, 2]], rest_mean, noise)
-    order = np.array([3, 4, 5, 0])
+    log_likelihood, mean, cov = _condition(u_mean, u_cov, np.eye(3)[[1, 2]], rest_mean, noise)
     log_evidence = components.log_weight.astype(float) + log_likelihood + log_factor
-    return log_evidence, mean[:, order], joint[:, order[:, None], order]
+    nodes, weights = np.polynomial.hermite_e.hermegauss(4)
+    nodes = np.stack(np.meshgrid(nodes, nodes, nodes), axis=-1).reshape(-1, 3)
+    weights = np.einsum("i,j,k->ijk", weights, weights, weights).ravel() / weights.sum() ** 3
+    d = (mean - u_mean)[:, None] + nodes @ np.linalg.cholesky(cov).transpose(0, 2, 1)
+    products = d[:, :, :1] * d[:, :, 1:] - u_cov[:, None, 0, 1:]
+    jacobian = components.jacobian.astype(float)
+    widening = products @ jacobian[:, :, 1:].transpose(0, 2, 1) / u_mean[:, :1, None]
+    position = components.x_mean[:, None] + d @ jacobian.transpose(0, 2, 1) + widening
+    points = np.concatenate([position, u_mean[:, None, :1] + d[:, :, :1]], axis=2)
+    moments = np.einsum("n,kni->ki", weights, points)
+    apart = points - moments[:, None]
+    spread = np.einsum("n,kni,knj->kij", weights, apart, apart)
+    spread[:, :3, :3] += unpack(components.x_cov)
+    return log_evidence, moments, spread
 
 
 def condition_on_length(
