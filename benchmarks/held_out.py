@@ -13,7 +13,7 @@ from rayfix_offline import trace
 from rayfix_offline.site import SiteFile
 from rayfix_offline.trace import LevelRays, trace_station
 from rayfix_offline.twin import Twin
-from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES, TubeMixture, unpack
+from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES, TubeMixture, joint_cov, unpack
 
 REFERENCE_RATIO = 1.1
 """Slices of the rays that held-out points are drawn from: finer than those of any fit."""
@@ -95,12 +95,8 @@ def log_density_as_measured(
     -------
     ndarray of shape (n,)
     """
-    u_cov, slope = unpack(mixture.u_cov.astype(np.float64)), mixture.jacobian.astype(np.float64)
-    cross = slope @ u_cov
-    cov = np.empty((len(mixture), 6, 6))
-    cov[:, :3, :3], cov[:, 3:, :3], cov[:, :3, 3:] = u_cov + np.diag(noise), cross, np.swapaxes(cross, 1, 2)
-    x_cov = unpack(mixture.x_cov.astype(np.float64)) + widening_cov(mixture.u_mean, u_cov, slope)
-    cov[:, 3:, 3:] = x_cov + cross @ np.swapaxes(slope, 1, 2)
+    cov = joint_cov(mixture)
+    cov[:, range(3), range(3)] += noise
     mean = np.concatenate([mixture.u_mean, mixture.x_mean], axis=1).astype(np.float64)
     log_parts = mixture.log_weight[:, None] + _log_normal(points - mean[:, None], cov)
     return np.asarray(np.logaddexp.reduce(log_parts, axis=0))

@@ -129,3 +129,14 @@ class TubeMixture:
                 for name, shape in FIELD_SHAPES.items()
             }
         )
+
+
+def joint_cov(mixture: TubeMixture) -> NDArray[np.float64]:
+    """Covariances of (u, x) of a mixture's components, widening included, shape (n, 6, 6); m and rad."""
+    u_cov, jacobian = unpack(np.asarray(mixture.u_cov, np.float64)), np.asarray(mixture.jacobian, np.float64)
+    across = jacobian @ u_cov
+    cov = np.empty((len(mixture), 6, 6))
+    cov[:, :3, :3], cov[:, 3:, :3], cov[:, :3, 3:] = u_cov, across, across.transpose(0, 2, 1)
+    cov[:, 3:, 3:] = unpack(np.asarray(mixture.x_cov, np.float64)) + across @ jacobian.transpose(0, 2, 1)
+    cov[:, 3:, 3:] += widening_cov(mixture.u_mean, u_cov, jacobian)
+    return cov

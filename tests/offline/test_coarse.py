@@ -19,7 +19,7 @@ from rayfix_offline.trace import LevelRays, trace_station
 from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_offline.twin import prepare_twin
 from rayfix_tables.level import WINDOW_RATIO, Level
-from rayfix_tables.mixture import TubeMixture, unpack, widening_cov
+from rayfix_tables.mixture import TubeMixture, joint_cov
 
 Array = NDArray[np.float64]
 WIDE = np.deg2rad(12.0)
@@ -56,13 +56,8 @@ def wide_cells(level: Level, fit: CoarseFit) -> list[tuple[float, TubeMixture]]:
 
 def joint(mixture: TubeMixture) -> tuple[Array, Array, Array]:
     """Log weights, means and covariances over (L, a, x), from the stored form."""
-    u_cov, slope = unpack(mixture.u_cov).astype(np.float64), mixture.jacobian.astype(np.float64)
-    cross = slope @ u_cov
-    cov = np.zeros((len(mixture), 6, 6))
-    cov[:, :3, :3], cov[:, 3:, :3], cov[:, :3, 3:] = u_cov, cross, np.swapaxes(cross, 1, 2)
-    cov[:, 3:, 3:] = unpack(mixture.x_cov).astype(np.float64) + cross @ np.swapaxes(slope, 1, 2)
-    cov[:, 3:, 3:] += widening_cov(mixture.u_mean, u_cov, slope)
-    return mixture.log_weight.astype(np.float64), np.concatenate([mixture.u_mean, mixture.x_mean], axis=1), cov
+    mean = np.concatenate([mixture.u_mean, mixture.x_mean], axis=1)
+    return mixture.log_weight.astype(np.float64), mean, joint_cov(mixture)
 
 
 def as_measured(points: Array, mixture: TubeMixture, variances: Array, rng: np.random.Generator) -> float:

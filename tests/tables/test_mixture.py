@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES, TubeMixture, pack, unpack, widening_cov
+from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES, TubeMixture, joint_cov, pack, unpack, widening_cov
 
 shapes = st.lists(st.integers(0, 3), max_size=2).map(tuple)
 seeds = st.integers(0, 2**32 - 1)
@@ -77,6 +77,26 @@ def test_stored_types(seed: int, count: int) -> None:
         assert array.flags.c_contiguous
         np.testing.assert_array_equal(array, getattr(mixture, name).astype(FIELD_DTYPES[name]))
     assert sum(getattr(stored, name).nbytes for name in FIELD_SHAPES) == count * (28 * 4 + 1)
+
+
+def test_joint_moments_agree_with_sampling() -> None:
+    """Of a million draws from the definition of a component; the sample's own deviation is some thousandths."""
+    rng = np.random.default_rng(7)
+    root, x_root = np.tril(rng.normal(size=(3, 3))) + 2.0 * np.eye(3), np.tril(rng.normal(size=(3, 3))) + np.eye(3)
+    mixture = TubeMixture(
+        log_weight=np.zeros(1),
+        u_mean=np.array([[6.0, 0.3, -0.2]]),
+        u_cov=pack((root @ root.T)[None]),
+        x_mean=np.zeros((1, 3)),
+        jacobian=rng.normal(size=(1, 3, 3)),
+        x_cov=pack((x_root @ x_root.T)[None]),
+        num_reflections=np.zeros(1, np.int8),
+    )
+    d = rng.standard_normal((1_000_000, 3)) @ root.T
+    slopes = mixture.jacobian[0]
+    x = d @ slopes.T + (d[:, :1] * d[:, 1:]) @ slopes[:, 1:].T / 6.0 + rng.standard_normal(d.shape) @ x_root.T
+    found = joint_cov(mixture)[0]
+    np.testing.assert_allclose(found, np.cov(np.column_stack([d, x]).T), rtol=0, atol=0.01 * np.trace(found) / 6.0)
 
 
 def test_widening_of_a_straight_tube_by_hand() -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rayfix_tables.angles import direction, wrap
 from rayfix_tables.level import Level
-from rayfix_tables.mixture import TubeMixture, unpack
+from rayfix_tables.mixture import TubeMixture, joint_cov, unpack
 
 Array = NDArray[np.float64]
 
@@ -107,10 +107,7 @@ def heard_paths(level: Level, places: Array) -> HeardPaths:
 
 def _as_gaussians(part: TubeMixture) -> tuple[Array, Array, Array, Array]:
     """Components as Gaussians over the position: log density at the mean, mean, deviations, inverse covariance."""
-    jacobian = np.asarray(part.jacobian, np.float64)
-    u_cov = unpack(np.asarray(part.u_cov, np.float64))
-    cov = unpack(np.asarray(part.x_cov, np.float64)) + jacobian @ u_cov @ jacobian.transpose(0, 2, 1)
-    cov += _FLOOR**2 * np.eye(3)
+    cov = joint_cov(part)[:, 3:, 3:] + _FLOOR**2 * np.eye(3)
     log_height = np.asarray(part.log_weight, np.float64) - 0.5 * np.linalg.slogdet(2.0 * np.pi * cov)[1]
     deviation = np.sqrt(np.einsum("nii->ni", cov))
     return log_height, np.asarray(part.x_mean, np.float64), deviation, np.asarray(np.linalg.inv(cov))

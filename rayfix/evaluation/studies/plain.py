@@ -19,7 +19,7 @@ from rayfix_service.fusion.lookup import Direction
 from rayfix_service.fusion.report import Report
 from rayfix_tables.errors import ReportError
 from rayfix_tables.level import Level
-from rayfix_tables.mixture import unpack
+from rayfix_tables.mixture import joint_cov
 from rayfix_tables.table import Table
 
 _MOST_PRODUCTS = 1_000
@@ -76,17 +76,11 @@ class PlainTableLocator:
 def joint_mixture(level: Level, cell: int) -> Mixture:
     """Mixture of a cell over (x, y, z, path length), m, the angles within the cell integrated out."""
     tubes = level.cell(cell)
-    jacobian = np.asarray(tubes.jacobian, np.float64)
-    u_cov = unpack(np.asarray(tubes.u_cov, np.float64))
-    across = jacobian @ u_cov
-    cov = np.empty((len(tubes), 4, 4))
-    cov[:, :3, :3] = across @ jacobian.transpose(0, 2, 1) + unpack(np.asarray(tubes.x_cov, np.float64))
-    cov[:, :3, 3] = cov[:, 3, :3] = across[:, :, 0]
-    cov[:, 3, 3] = u_cov[:, 0, 0]
+    order = np.array([3, 4, 5, 0])
     return Mixture(
         log_weight=np.asarray(tubes.log_weight, np.float64),
         mean=np.column_stack([tubes.x_mean, tubes.u_mean[:, 0]]).astype(np.float64),
-        cov=cov,
+        cov=joint_cov(tubes)[:, order[:, None], order],
     )
 
 

@@ -18,8 +18,8 @@ def condition_on_angle(
 ) -> tuple[Array, Array, Array]:
     """Condition the components of one cell on the rest of the measured angle.
 
-    The ray coordinates u are Gaussian. The position's moments are sums over Gauss-Hermite nodes of u, which are exact for
-    the products that a widening tube makes.
+    The ray coordinates u are Gaussian. The position's moments are sums over Gauss-Hermite nodes of u, which are exact
+    for the products that a widening tube makes.
 
     Parameters
     ----------
@@ -42,9 +42,9 @@ def condition_on_angle(
     noise = np.array([[rest_cov[0], rest_cov[1]], [rest_cov[1], rest_cov[2]]])
     log_likelihood, mean, cov = _condition(u_mean, u_cov, np.eye(3)[[1, 2]], rest_mean, noise)
     log_evidence = components.log_weight.astype(float) + log_likelihood + log_factor
-    nodes, weights = np.polynomial.hermite_e.hermegauss(4)
-    nodes = np.stack(np.meshgrid(nodes, nodes, nodes), axis=-1).reshape(-1, 3)
-    weights = np.einsum("i,j,k->ijk", weights, weights, weights).ravel() / weights.sum() ** 3
+    roots, shares = np.polynomial.hermite_e.hermegauss(4)
+    nodes = np.stack(np.meshgrid(roots, roots, roots), axis=-1).reshape(-1, 3)
+    weights = np.einsum("i,j,k->ijk", shares, shares, shares).ravel() / shares.sum() ** 3
     d = (mean - u_mean)[:, None] + nodes @ np.linalg.cholesky(cov).transpose(0, 2, 1)
     products = d[:, :, :1] * d[:, :, 1:] - u_cov[:, None, 0, 1:]
     jacobian = components.jacobian.astype(float)

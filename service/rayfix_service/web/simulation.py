@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rayfix_tables.angles import wrap
 from rayfix_tables.errors import ReportError
-from rayfix_tables.mixture import unpack
+from rayfix_tables.mixture import joint_cov
 from rayfix_tables.table import StationPart, Table
 
 Kind = Literal["aoa", "pt", "toa", "tdoa"]
@@ -61,10 +61,8 @@ def find_path(part: StationPart, place: NDArray[np.float64]) -> SimulatedPath | 
         return None
     apart = ((mixture.x_mean - place.astype(np.float32)) ** 2).sum(axis=1)
     near = np.arange(len(apart)) if len(apart) <= _NEAREST else np.argpartition(apart, _NEAREST)[:_NEAREST]
-    u_cov = unpack(mixture.u_cov[near]).astype(np.float64)
-    jacobian = mixture.jacobian[near].astype(np.float64)
-    cross = u_cov @ jacobian.transpose(0, 2, 1)
-    x_cov = jacobian @ cross + unpack(mixture.x_cov[near])
+    cov = joint_cov(mixture[near])
+    cross, x_cov = cov[:, :3, 3:], cov[:, 3:, 3:]
     from_mean = place - mixture.x_mean[near]
     gain = np.linalg.solve(x_cov, from_mean[:, :, None])[:, :, 0]
     square = np.einsum("ni,ni->n", from_mean, gain)
