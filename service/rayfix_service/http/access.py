@@ -12,8 +12,7 @@ from rayfix_service.http.problems import (
     TOO_MANY_REQUESTS,
     UNAUTHORIZED,
     ProblemError,
-    problem_document,
-    problem_response,
+    error_response,
     problem_responses,
 )
 from rayfix_service.http.rates import RateLimit
@@ -42,8 +41,7 @@ class Access:
             try:
                 self._admit(scope)
             except ProblemError as error:
-                answer = problem_response(problem_document(error.kind, str(error)), error.headers)
-                await answer(scope, receive, send)
+                await error_response(error)(scope, receive, send)
                 return
         await self._app(scope, receive, send)
 

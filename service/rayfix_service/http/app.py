@@ -1,6 +1,7 @@
 """The web application."""
 
 import asyncio
+import gc
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -26,6 +27,7 @@ from rayfix_service.http.rates import RateLimit
 from rayfix_service.http.request_context import HEADER, RequestContext
 from rayfix_service.http.routes_stream import FixEventDocument
 from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.http.short_way import ShortWay
 from rayfix_service.http.slow_fixes import SlowFixes
 from rayfix_service.http.stopping import on_stop_signal
 from rayfix_service.http.tables import Tables
@@ -96,6 +98,8 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
         keeping = [asyncio.create_task(tables.keep(settings.watch_seconds))]
         if keys is not None:
             keeping.append(asyncio.create_task(_keep_keys(keys, settings.watch_seconds)))
+        if settings.own_process:
+            keeping.append(asyncio.create_task(_freeze(tables)))
         if settings.runtime_folder is not None:
             state.relay = FeedRelay(state.feed, settings.runtime_folder)
             keeping.append(asyncio.create_task(state.relay.keep()))
@@ -137,6 +141,7 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
     app.state.relay = None
     keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
     app.state.rate_limit = limit = _rate_limit(settings)
+    app.add_middleware(ShortWay, path="/v1/positions", answer=routes_positions.answer_position)  # inside all others
     app.add_middleware(Access, keys=keys, limit=limit)
     if settings.cors_origins:
         # Around the access control, since a browser asks without a key whether it may send one.
@@ -149,7 +154,6 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
         )
     install_problems(app)
     app.add_middleware(RequestContext, metrics=app.state.metrics)  # around all, to see the last resort's answers too
-    app.include_router(routes_positions.single_router)
     app.include_router(routes_positions.router)
     app.include_router(routes_formats.router)
     app.include_router(routes_stream.router)
@@ -178,6 +182,13 @@ async def _keep_keys(keys: ApiKeys, seconds: float) -> None:
                 _log.error("keys not read again: %s", error)
         else:
             failure = ""
+
+
+async def _freeze(tables: Tables) -> None:
+    """Let the garbage collector leave alone what is there once the process can locate."""
+    await tables.became_ready.wait()
+    gc.collect()
+    gc.freeze()
 
 
 async def _take_turn(tables: Tables, marker: Path, stopping: asyncio.Event) -> None:

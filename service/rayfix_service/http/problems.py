@@ -143,14 +143,16 @@ def problem_responses(*kinds: ProblemKind) -> dict[int | str, dict[str, Any]]:
     return {kind.status: {"description": kind.title, "content": {MEDIA_TYPE: {"schema": schema}}} for kind in kinds}
 
 
-async def _answer_problem(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, ProblemError)
-    return problem_response(problem_document(error.kind, str(error), error.errors), error.headers)
-
-
-async def _answer_report(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, ReportError)
+def error_response(error: ProblemError | ReportError) -> JSONResponse:
+    """Answer with the problem that an error tells of."""
+    if isinstance(error, ProblemError):
+        return problem_response(problem_document(error.kind, str(error), error.errors), error.headers)
     return problem_response(report_problem(error))
+
+
+async def _answer_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, ProblemError | ReportError)
+    return error_response(error)
 
 
 async def _answer_validation(request: Request, error: Exception) -> JSONResponse:
@@ -207,8 +209,8 @@ class LastResort:
 
 def install_problems(app: FastAPI) -> None:
     """Make every error of `app` a problem document."""
-    app.add_exception_handler(ProblemError, _answer_problem)
-    app.add_exception_handler(ReportError, _answer_report)
+    app.add_exception_handler(ProblemError, _answer_error)
+    app.add_exception_handler(ReportError, _answer_error)
     app.add_exception_handler(RequestValidationError, _answer_validation)
     app.add_exception_handler(WebSocketRequestValidationError, _answer_validation)  # before the handshake
     app.add_exception_handler(HTTPException, _answer_http)

@@ -68,7 +68,7 @@ def serve(
         written to.
     """
     path = Path(tables_path).absolute()
-    settings = settings or ServiceSettings()
+    settings = replace(settings or ServiceSettings(), own_process=True)
     if workers < 1:
         raise ServiceError(f"workers is {workers}; give at least 1")
     for table_path in TableFiles(path=path).find().values():

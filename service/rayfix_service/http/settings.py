@@ -40,6 +40,9 @@ class ServiceSettings:
         Omlox hub that is told of all positions.
     simulation : bool
         Whether ``POST /v1/simulations`` answers.
+    own_process : bool
+        Whether the process does nothing else. Its garbage collector then leaves alone what is there once it is ready,
+        so that requests wait less for it.
     runtime_folder : pathlib.Path, optional
         Folder that the workers of one service share; none for a single process.
     """
@@ -56,4 +59,5 @@ class ServiceSettings:
     track: bool = False
     hub: HubSettings | None = None
     simulation: bool = False
+    own_process: bool = False
     runtime_folder: Path | None = None
