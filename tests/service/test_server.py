@@ -3,14 +3,19 @@
 import errno
 import json
 import os
+import re
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from rayfix_service.http.errors import ServiceError
@@ -74,6 +79,66 @@ def test_several_workers_share_a_port(hall_table_path: Path, start_server: Start
             assert "rayfix_ready 1.0" in figures
         log = server.stop()
     assert "Traceback" not in log
+
+
+def test_requests_under_way_are_finished(hall_table_path: Path, start_server: StartServer):
+    batch = {"reports": [REPORT] * 300}
+    with start_server(hall_table_path) as server, ThreadPoolExecutor(4) as pool:
+
+        def post() -> int:
+            with server.client() as http:
+                response = http.post("/v1/positions/batch", json=batch)
+                assert len(response.json()["results"]) == 300
+                return response.status_code
+
+        posted = [pool.submit(post) for _ in range(4)]
+        # The first batch is under way when the figures are answered between two of its fixes.
+        with server.client() as http:
+            while _figure(http.get("/metrics").text, "rayfix_fusion_seconds_count") < 1:
+                time.sleep(0.001)
+        server.process.send_signal(signal.SIGTERM)
+        under_way = [future for future in posted if not future.done()]
+        log = server.stop()
+        assert under_way
+        assert [future.result() for future in posted] == [200] * 4
+    assert "Cancel" not in log
+
+
+def _figure(figures: str, name: str) -> float:
+    return next(float(line.split()[1]) for line in figures.splitlines() if line.startswith(f"{name} "))
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_replaced_and_only_its_requests_fail(hall_table_path: Path, start_server: StartServer):
+    done = threading.Event()
+
+    def post() -> tuple[int, list[int]]:
+        """Post until told to end; how often the connection broke, and the statuses of answers."""
+        broken, statuses = 0, []
+        while not done.is_set():
+            with server.client() as http:
+                try:
+                    while not done.is_set():
+                        statuses.append(http.post("/v1/positions", json=REPORT).status_code)
+                except httpx.TransportError:
+                    broken += 1
+        return broken, statuses
+
+    with start_server(hall_table_path, workers=2) as server, ThreadPoolExecutor(4) as pool:
+        (first, _) = (int(pid) for pid in re.findall(r"Started server process \[(\d+)\]", "".join(server.log)))
+        posting = [pool.submit(post) for _ in range(4)]
+        time.sleep(0.5)
+        os.kill(first, signal.SIGKILL)
+        server.wait_for("ready with", 3)
+        time.sleep(0.5)
+        done.set()
+        results = [future.result() for future in posting]
+        with server.client() as http:
+            assert "rayfix_ready 1.0" in http.get("/metrics").text
+        server.stop()
+    # A client had one request on the way; with a new connection, the worker that is left or the new one answers.
+    assert all(broken <= 1 for broken, _ in results)
+    assert {status for _, statuses in results for status in statuses} == {200}
 
 
 def test_the_log_may_be_json(hall_table_path: Path, start_server: StartServer):
