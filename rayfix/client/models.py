@@ -101,8 +101,9 @@ class StationAnswer:
 
 @dataclass(frozen=True, kw_only=True)
 class TableAnswer:
-    """The table that answers."""
+    """A table that answers; ``name`` is what a client's ``table`` takes."""
 
+    name: str
     table_id: str
     format_version: int
     software_version: str
@@ -172,6 +173,7 @@ def station_answers(document: Mapping[str, Any]) -> tuple[StationAnswer, ...]:
 def table_answer(document: Mapping[str, Any]) -> TableAnswer:
     """Read the summary of a table; KeyError, TypeError or ValueError for what is none."""
     return TableAnswer(
+        name=document["name"],
         table_id=document["table_id"],
         format_version=document["format_version"],
         software_version=document["software_version"],
@@ -181,6 +183,11 @@ def table_answer(document: Mapping[str, Any]) -> TableAnswer:
         num_stations=document["num_stations"],
         num_components=document["num_components"],
     )
+
+
+def table_answers(document: Mapping[str, Any]) -> tuple[TableAnswer, ...]:
+    """Read the list of tables; KeyError, TypeError or ValueError for what is none."""
+    return tuple(table_answer(one) for one in document["tables"])
 
 
 def _track(document: Mapping[str, Any]) -> TrackAnswer:

@@ -31,6 +31,7 @@ from rayfix.client.models import (
     fix_answer,
     station_answers,
     table_answer,
+    table_answers,
 )
 from rayfix.client.retries import NO_RETRIES, RetryPolicy
 from rayfix.client.settings import ClientSettings
@@ -126,6 +127,10 @@ class Client:
     def table(self) -> TableAnswer:
         """Tell which table answers."""
         return self._ask(Call(method="GET", path="/v1/table", query=self.settings.table_query), table_answer)
+
+    def tables(self) -> tuple[TableAnswer, ...]:
+        """List all tables of the service."""
+        return self._ask(Call(method="GET", path="/v1/tables"), table_answers)
 
     def ready(self) -> bool:
         """Whether the service can locate now; asks once."""

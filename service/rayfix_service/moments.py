@@ -5,13 +5,20 @@ from datetime import UTC, datetime, timedelta
 
 
 def utc_moment(timestamp: str) -> datetime:
-    """Turn a date-time of RFC 3339 into a moment in UTC, to the microsecond."""
+    """Turn a date-time of RFC 3339 into a moment in UTC, to the microsecond.
+
+    Which its offset puts before the year 1 or after 9999 becomes the first or last moment that there is.
+    """
     # Python knows no leap seconds.
     leap = re.match(r"(.{17})60", timestamp)
     text = f"{leap[1]}59{timestamp[19:]}" if leap else timestamp
     # Nor more than six digits of a second.
     text = re.sub(r"(\.[0-9]{6})[0-9]+", r"\1", text.upper())
-    return datetime.fromisoformat(text).astimezone(UTC) + timedelta(seconds=1 if leap else 0)
+    moment = datetime.fromisoformat(text)
+    try:
+        return moment.astimezone(UTC) + timedelta(seconds=1 if leap else 0)
+    except OverflowError:
+        return (datetime.min if moment.year == 1 else datetime.max).replace(tzinfo=UTC)
 
 
 def utc_milliseconds(timestamp: str) -> str:

@@ -366,6 +366,15 @@ def test_a_packet_that_all_stations_heard_does_not_wait(locator: Locator):
     assert len(stream.due(1006.0)) == 1
 
 
+@pytest.mark.parametrize("command", ["mqtt", "serve"])
+def test_a_hub_that_is_no_address_is_one_line(
+    command: str, hall_table_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, str(hall_table_path), "--omlox-hub", "hub:8081"]) == 2
+    error = capsys.readouterr().err
+    assert error == "rayfix: omlox hub 'hub:8081' is no address; give that of its API, e.g. http://hub:8081/v2\n"
+
+
 def test_without_the_extra_the_command_says_which(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], hall_table_path: Path
 ):

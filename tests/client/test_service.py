@@ -42,6 +42,22 @@ def test_a_fix_has_what_the_service_answers(service_url: str, report: dict[str, 
     assert omlox["provider_id"] == report["target_id"]
 
 
+def test_a_target_is_followed(service_url: str, report: dict[str, Any]):
+    with rayfix.Client(service_url, track=True) as client:
+        fixes = [client.locate({**report, "timestamp": f"2026-01-31T10:00:00.{n}Z"}) for n in range(3)]
+        (batch,) = client.locate_batch([{**report, "timestamp": "2026-01-31T10:00:00.4Z"}])
+        (streamed,) = client.stream([{**report, "timestamp": "2026-01-31T10:00:00.6Z"}])
+        assert isinstance(batch, FixAnswer)
+        assert isinstance(streamed, FixAnswer)
+        with pytest.raises(RefusedReportError) as found:
+            client.locate({**report, "timestamp": None})
+    assert found.value.path == ("timestamp",)
+    tracks = [fix.track for fix in (*fixes, batch, streamed)]
+    assert [track.num_reports for track in tracks if track] == [1, 2, 3, 4, 5]
+    assert tracks[-1] is not None
+    assert tracks[-1].horizontal_accuracy_m < (fixes[0].horizontal_accuracy_m or 0.0)
+
+
 def test_a_refused_report_names_the_field(service_url: str, report: dict[str, Any]):
     report["measurements"][1]["station_id"] = "nowhere"
     with rayfix.Client(service_url) as client, pytest.raises(RefusedReportError, match="nowhere") as found:
@@ -68,8 +84,10 @@ def test_a_batch_is_cut_and_put_together(service_url: str, report: dict[str, Any
 def test_table_and_stations(service_url: str):
     with rayfix.Client(service_url) as client:
         stations, table = client.stations(), client.table()
+        assert client.tables() == (table,)
     assert [station.id for station in stations] == ["bs1", "bs2", "bs3", "bs4"]
     assert (stations[0].position.x, stations[0].bearing_deg) == (0.1, 45.0)
+    assert table.name == "hall"
     assert (table.site_name, table.num_stations, len(table.table_id)) == ("hall", 4, 64)
 
 
@@ -119,6 +137,7 @@ def test_the_client_for_asyncio_does_the_same(service_url: str, report: dict[str
             assert (await client.locate_as(report, "3gpp"))["shape"] == "LOCAL_3D_POINT_UNCERTAINTY_ELLIPSOID"
             assert [station.id for station in await client.stations()] == ["bs1", "bs2", "bs3", "bs4"]
             assert (await client.table()).site_name == "hall"
+            assert await client.tables() == (await client.table(),)
             answers = await client.locate_batch([report, {"measurements": []}])
             assert isinstance(answers[0], FixAnswer)
             assert isinstance(answers[1], ProblemError)

@@ -5,6 +5,8 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from rayfix_service.fusion.beam import Hypotheses
 from rayfix_service.fusion.locator import Fused
@@ -219,3 +221,50 @@ def test_the_largest_group_hangs_together():
     points = np.concatenate([chain, heap])
     shuffle = rng.permutation(len(points))
     np.testing.assert_array_equal(largest_group(points[shuffle]), shuffle < 40)
+
+
+PLACES = st.tuples(*[st.floats(-29.0, 29.0)] * 3).map(list)
+
+
+@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(-20.0, 20.0),
+            st.sampled_from(["a", "b", "c", "d"]),
+            st.none() | st.lists(PLACES, min_size=1, max_size=4),
+            st.sampled_from([0.003, 0.3, 10.0]),
+            st.sampled_from([-300.0, -5.0, 5.0]),
+        ),
+        min_size=1,
+        max_size=12,
+    )
+)
+def test_whatever_comes_in_whatever_order_a_track_is_sound(
+    sheet_scene: Scene,
+    make_hypotheses: Callable[..., Hypotheses],
+    make_fused: Callable[..., Fused],
+    reports: list[tuple[float, str, list[list[float]] | None, float, float]],
+):
+    tracker = Tracker(sheet_scene, TrackingSettings(max_targets=3, num_particles=64))
+    latest: dict[str, datetime] = {}
+    for seconds, target, places, stdev, log_lost in reports:
+        moment = datetime(2026, 1, 31, 10, tzinfo=UTC) + timedelta(seconds=seconds)
+        hypotheses = None if places is None else make_hypotheses(places, stdev, None, log_lost)
+        track = tracker.follow(make_fused(hypotheses, target=target, timestamp=moment.isoformat()))
+        assert len(tracker) <= 3
+        if track is None:
+            assert places is None or target not in latest
+            continue
+        told = datetime.fromisoformat(track.timestamp)
+        if track.state in ("updated", "predicted"):
+            assert told == moment > latest[target]
+        elif track.state == "late":
+            assert told == latest[target] >= moment
+        latest[target] = told
+        found = track.estimate
+        assert np.isfinite(found.position).all()
+        assert np.abs(found.position).max() <= 30.0
+        assert np.linalg.eigvalsh(found.covariance).min() > 0.0
+        assert np.linalg.eigvalsh(found.velocity_covariance).min() > 0.0
+        assert 0.0 < found.probability <= 1.0
