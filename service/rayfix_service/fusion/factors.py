@@ -70,9 +70,8 @@ def make_factor(
         return None
     timed = bool(observation.lengths or observation.readings)
     may_be_late = timed and observation.angle_index is not None
-    kinds, readings = _good_kinds(observation, max_path_length)
+    kinds, readings = _good_kinds(observation, log_good if may_be_late else 0.0, max_path_length)
     if may_be_late:
-        kinds = [kind._replace(log_weight=kind.log_weight + log_good) for kind in kinds]
         kinds.append(_Kind(TIME_OUTLIER, log_bad + log_any_time, *_ANY_LENGTH[1:]))
     columns, outlier = make_alternatives(
         *join(heard),
@@ -108,7 +107,9 @@ class _Kind(NamedTuple):
     last_reading: int = 0
 
 
-def _good_kinds(observation: Observation, max_path_length: float) -> tuple[list[_Kind], list[tuple[int, float, float]]]:
+def _good_kinds(
+    observation: Observation, log_times_good: float, max_path_length: float
+) -> tuple[list[_Kind], list[tuple[int, float, float]]]:
     """Alternatives for which all times are what they seem, of each combination of the Gaussians of their errors.
 
     Also gives the readings of clocks that these take in, as :data:`READING` has them.
@@ -117,13 +118,12 @@ def _good_kinds(observation: Observation, max_path_length: float) -> tuple[list[
     log_clocks = -len({reading.clock for reading in observation.readings}) * math.log(max_path_length)
     kinds = []
     readings: list[tuple[int, float, float]] = []
-    for log_weight, joint in _joint_readings(observation.readings):
+    for log_readings, joint in _joint_readings(observation.readings):
         first, last = len(readings), len(readings) + len(joint)
         readings += joint
-        kinds += [
-            _Kind(ALL_GOOD, log_weight + length.log_weight, length.value, length.variance, log_clocks, first, last)
-            for length in _joint_lengths(observation)
-        ]
+        for length in _joint_lengths(observation):
+            log_weight = log_times_good + log_readings + length.log_weight
+            kinds.append(_Kind(ALL_GOOD, log_weight, length.value, length.variance, log_clocks, first, last))
     return kinds, readings
 
 

@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,23 +67,63 @@ class HeardStation:
 
 def _condition(lookup: Lookup) -> Heard:
     """Condition every component of the cells looked up on the rest of the measured angle."""
-    level = lookup.level
-    begins, ends = level.cell_offsets[lookup.cells], level.cell_offsets[lookup.cells + 1]
-    total = int((ends - begins).sum())
-    heard = Heard(np.empty(total), np.empty((total, 4)), np.empty((total, 4, 4)))
-    mixture = level.mixture
+    level, mixture = lookup.level, lookup.level.mixture
+    return Heard(
+        *_condition_cells(
+            mixture.log_weight,
+            mixture.u_mean,
+            mixture.u_cov,
+            mixture.x_mean,
+            mixture.jacobian,
+            mixture.x_cov,
+            level.cell_offsets,
+            level.cell_log_mass,
+            lookup.cells,
+            np.ascontiguousarray(lookup.rest_mean),
+            np.ascontiguousarray(lookup.rest_cov),
+            lookup.log_factor,
+        )
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _condition_cells(
+    log_weight: Any,
+    u_mean: Any,
+    u_cov: Any,
+    x_mean: Any,
+    jacobian: Any,
+    x_cov: Any,
+    cell_offsets: Any,
+    cell_log_mass: Any,
+    cells: Any,
+    rest_mean: Any,
+    rest_cov: Any,
+    log_factor: Any,
+) -> Any:
+    """Make room for the components of some cells, and condition them; the arguments are those of level and lookup."""
+    count = len(cells)
+    begins, ends, log_scale = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
+    total = 0
+    for n in range(count):
+        begins[n], ends[n] = cell_offsets[cells[n]], cell_offsets[cells[n] + 1]
+        log_scale[n] = log_factor[n] + cell_log_mass[cells[n]]
+        total += ends[n] - begins[n]
+    log_evidence, mean, cov = np.empty(total), np.empty((total, 4)), np.empty((total, 4, 4))
     condition_on_angle(
-        mixture.log_weight,
-        mixture.u_mean,
-        mixture.u_cov,
-        mixture.x_mean,
-        mixture.jacobian,
-        mixture.x_cov,
+        log_weight,
+        u_mean,
+        u_cov,
+        x_mean,
+        jacobian,
+        x_cov,
         begins,
         ends,
-        np.ascontiguousarray(lookup.rest_mean),
-        np.ascontiguousarray(lookup.rest_cov),
-        lookup.log_factor + level.cell_log_mass[lookup.cells],
-        *heard,
+        rest_mean,
+        rest_cov,
+        log_scale,
+        log_evidence,
+        mean,
+        cov,
     )
-    return heard
+    return log_evidence, mean, cov

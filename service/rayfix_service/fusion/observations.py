@@ -19,7 +19,7 @@ from rayfix_service.fusion.report import (
     TimeOfArrival,
 )
 from rayfix_tables.errors import ReportError
-from rayfix_tables.site import SiteInfo, Station
+from rayfix_tables.site import NO_BIAS, SiteInfo, Station
 
 MOST_COMBINATIONS = 256
 """Combinations of Gaussians that the measurements of one path may be of: eight of heavy tails, or two powers."""
@@ -154,6 +154,8 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
 
 def _unbiased(arrival: Arrival, station: Station) -> Arrival:
     bias = station.bias
+    if bias == NO_BIAS:
+        return arrival
     return replace(arrival, offset=arrival.offset - bias.range, variance=arrival.variance + bias.range_stdev**2)
 
 
@@ -163,6 +165,8 @@ def _refuse_repetitions(report: Report) -> None:
     Two paths of a station may well be of one length, so a length may be repeated once for each of its angles. Time
     differences may be repeated: they say the same of the same arrivals.
     """
+    if len(set(report.measurements)) == len(report.measurements):
+        return
     paths: defaultdict[str, int] = defaultdict(int)
     for measurement in report.measurements:
         paths[measurement.station_id] += isinstance(measurement, Angle)
