@@ -33,7 +33,7 @@ demo: $(VENV)/.done
 	$(BIN)/rayfix demo --output demo
 
 test: $(VENV)/.done
-	$(BIN)/python -m pytest --ignore tests/browser
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
 
 # In a real browser; what it showed is kept in browser-artefacts/.
 browser: $(VENV)/.done viewer

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -229,6 +230,15 @@ def test_check_lists_all_problems_at_once(capsys: pytest.CaptureFixture[str], tm
     assert not (tmp_path / "t.h5").exists()
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Children of a process that ignores SIGINT, as shells start it in the background, would ignore it too."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_build_leaves_the_former_table(tmp_path: Path, hall_table_path: Path) -> None:
     main(["example", str(tmp_path / "site")])
     table = Path(shutil.copy(hall_table_path, tmp_path / "t.h5"))
