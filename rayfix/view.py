@@ -132,8 +132,15 @@ def inline(static: Path, data: Mapping[str, Any], *, title: str) -> str:
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     body = f'<script type="application/json" id="rayfix-data">{text}</script><script type="module">{script}</script>'
     page = re.sub(r"\s*<script\b[^>]*></script>|\s*<link rel=\"stylesheet\"[^>]*>|\s*<title>.*?</title>", "", page)
-    page = page.replace("</head>", f"{head}\n  </head>", 1)
+    page = page.replace("</head>", f"{head}\n  </head>", 1).replace("<head>", f"<head>\n{_licences(static)}", 1)
     return page.replace("</body>", f"{body}\n  </body>", 1)
+
+
+def _licences(static: Path) -> str:
+    """Licences of what is bundled, which must go with it, as a comment."""
+    path = static / "third-party-licences.md"
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    return f"<!--\n{text.replace('--', '- -')}-->"
 
 
 def _event(locator: Locator, document: Mapping[str, Any]) -> dict[str, Any]:

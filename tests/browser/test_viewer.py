@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rayfix.cli import main
 from rayfix.evaluation.forward import ForwardSolver
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths, report_text, simulate_example_report
 from rayfix.example.hall import hall_scene, hall_stations
+from rayfix_service.http.keys import add_key
 
 expect = pytest.importorskip("playwright.sync_api", reason="playwright is not installed").expect
 
@@ -218,3 +220,37 @@ def test_keys_change_what_is_seen(open_page: OpenPage, hall_url: str, artefacts:
     page.keyboard.press("Escape")
     page.keyboard.press("t")
     assert page.evaluate("document.documentElement.dataset.theme") == "light"
+
+
+def test_a_page_from_disk_shows_its_fix(
+    open_page: OpenPage, hall_table_path: Path, tmp_path: Path, artefacts: Path, report: dict[str, Any]
+):
+    (tmp_path / "report.json").write_text(json.dumps(report), encoding="utf-8")
+    assert main(["view", str(hall_table_path), str(tmp_path / "report.json"), "-o", str(tmp_path / "fix.html")]) == 0
+    page = open_page((tmp_path / "fix.html").as_uri(), scheme="light")
+    page.wait_for_selector("h2:has-text('agv-7')")
+    page.keyboard.press("Enter")
+    count, share = colours(drawing(page))
+    assert count > 200
+    assert share < 0.9
+    page.screenshot(path=artefacts / "page.png")
+    assert page.evaluate(f"({PATHS})().length") >= 3
+
+
+def test_a_key_is_asked_for_and_sent(
+    browser: Any, serve: Callable[..., Any], hall_table_path: Path, tmp_path: Path, artefacts: Path
+):
+    """Refusals are logged by the browser, so this page is not one of those that may log nothing."""
+    key = add_key(tmp_path / "keys", "viewer")
+    with serve(hall_table_path, "--api-keys", tmp_path / "keys") as url:
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.goto(url)
+        page.wait_for_selector("text=The service asks for a key")
+        page.screenshot(path=artefacts / "key.png")
+        for text, then in (("wrong", "text=does not know this key"), (key, "html[data-ready]")):
+            page.fill("input[type=password]", text)
+            page.keyboard.press("Enter")
+            page.wait_for_selector(then)
+        page.wait_for_selector("#connection.live")
+        assert page.evaluate("[localStorage.length, Object.values(sessionStorage)]") == [0, [key]]
+        page.close()

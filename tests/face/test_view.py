@@ -38,6 +38,7 @@ def built(tmp_path: Path) -> Path:
         '\n<link rel="stylesheet" crossorigin href="./assets/i.css">\n</head><body><div id="app"></div></body></html>',
         encoding="utf-8",
     )
+    (static / "third-party-licences.md").write_text("three (MIT) -- with its licence", encoding="utf-8")
     (static / "assets" / "i.js").write_text('const a = "</script><!-- \\u0026";', encoding="utf-8")
     (static / "assets" / "i.css").write_text("p { color: red }", encoding="utf-8")
     return static
@@ -56,6 +57,7 @@ def test_the_page_is_whole_and_its_policy_fits(built: Path):
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
         assert f"{name} &#x27;sha256-{digest}&#x27;" in page
     assert "unsafe" not in page
+    assert "<!--\nthree (MIT) - - with its licence-->" in page
 
 
 def test_without_the_viewer_it_says_what_to_do(tmp_path: Path):

@@ -10,6 +10,7 @@ export default defineConfig({
     modulePreload: false,
     assetsInlineLimit: 0,
     chunkSizeWarningLimit: 1000,
+    license: { fileName: "third-party-licences.md" },
   },
   server: {
     proxy: { "/v1": { target: "http://127.0.0.1:8000", ws: true } },
