@@ -81,6 +81,7 @@ export class Stage {
     this.controls.enableDamping = true;
     this.controls.dampingFactor = 0.15;
     this.controls.zoomToCursor = true;
+    this.controls.listenToKeyEvents(canvas);
     this.controls.maxPolarAngle = Math.PI * 0.98;
     this.controls.addEventListener("change", () => this.invalidate());
     this.controls.addEventListener("start", () => (this.untouched = false));
