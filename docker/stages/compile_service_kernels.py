@@ -1,6 +1,6 @@
 """Compile the kernels of the service into ``NUMBA_CACHE_DIR``, when its image is built.
 
-A service compiles its kernels when it starts, by answering reports of each kind from its table. Here it does so with a
+A service compiles its kernels when it loads a table, by answering reports of each kind from it. Here it does so with a
 table of an empty room, written without ray tracing: the service's image is built without the offline packages.
 """
 
@@ -10,14 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.http.tables import load_table
 from rayfix_tables.angles import direction
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture, pack
 from rayfix_tables.site import SiteInfo, Station
-from rayfix_tables.table import Table
 from rayfix_tables.version import software_version
 from rayfix_tables.write import SceneContent, StationContent, write_table
 
@@ -30,7 +29,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "room.h5"
         write_room(path)
-        Locator(Table.open(path)).warm_up()
+        load_table("room", path)
 
 
 def write_room(path: Path) -> None:
