@@ -7,7 +7,7 @@ Where the best candidate is less probable than p, the region reaches to its riva
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -67,13 +67,18 @@ class CredibleRegions:
     points: NDArray[np.float64]
     share: float
 
+    def accuracies(self, probability: float) -> "Accuracies":
+        """Circle, layer and ellipsoid that each hold the UE with a probability, in one go."""
+        radius, half_height, shape = _accuracies(self.points, self.position, self.covariance, self._place(probability))
+        ellipsoid = Ellipsoid(centre=self.position, shape=shape, probability=min(probability, self.share))
+        return Accuracies(radius, half_height, ellipsoid)
+
     def ellipsoid(self, probability: float) -> Ellipsoid:
         """Ellipsoid that holds the UE with a probability.
 
         It has the shape of the best candidate's covariance or of the whole posterior's, whichever makes it smaller.
         """
-        whole = _second_moment(self.points, self.position) + 1e-9 * self.covariance
-        return min((self._scaled(shape, probability) for shape in (self.covariance, whole)), key=_volume)
+        return self.accuracies(probability).ellipsoid
 
     def upright_ellipsoid(self, probability: float) -> Ellipsoid:
         """Ellipsoid with one axis vertical that holds the UE with a probability."""
@@ -83,28 +88,41 @@ class CredibleRegions:
 
     def horizontal_radius(self, probability: float) -> float:
         """Radius, m, of the horizontal circle that holds the UE with a probability."""
-        apart = self.points[:, :2] - self.position[:2]
-        return math.sqrt(self._quantile(np.einsum("ni,ni->n", apart, apart), probability))
+        return self.accuracies(probability).horizontal_radius
 
     def vertical_half_height(self, probability: float) -> float:
         """Half the height, m, of the layer that holds the UE with a probability."""
-        return self._quantile(np.abs(self.points[:, 2] - self.position[2]), probability)
+        return self.accuracies(probability).vertical_half_height
 
     def _scaled(self, shape: NDArray[np.float64], probability: float) -> Ellipsoid:
-        radius = self._quantile(_squared_distances(self.points, self.position, shape), probability)
+        squares = _squared_distances(self.points, self.position, shape)
         return Ellipsoid(
-            centre=self.position, shape=max(radius, 1e-12) * shape, probability=min(probability, self.share)
+            centre=self.position,
+            shape=_scale(squares, self._place(probability)) * shape,
+            probability=min(probability, self.share),
         )
 
-    def _quantile(self, values: NDArray[np.float64], probability: float) -> float:
-        """Least of the points' values up to which they are as probable; the largest where they are not."""
-        count = math.ceil(min(1.0, probability / max(self.share, 1e-9)) * len(values))
-        place = max(count, 1) - 1
-        return float(np.partition(values, place)[place])
+    def _place(self, probability: float) -> int:
+        """Place, among the points' values in their order, of the least up to which they are as probable.
+
+        The last where they never are.
+        """
+        count = math.ceil(min(1.0, probability / max(self.share, 1e-9)) * len(self.points))
+        return max(count, 1) - 1
 
 
-def _volume(ellipsoid: Ellipsoid) -> float:
-    return float(np.linalg.det(ellipsoid.shape))
+class Accuracies(NamedTuple):
+    """Regions around a position, each of which holds the UE with the same probability.
+
+    Attributes
+    ----------
+    horizontal_radius, vertical_half_height : float, m
+    ellipsoid : Ellipsoid
+    """
+
+    horizontal_radius: float
+    vertical_half_height: float
+    ellipsoid: Ellipsoid
 
 
 def posterior_points(
@@ -151,6 +169,38 @@ def _all_points(
     mean: NDArray[np.float64], cov: NDArray[np.float64], normal_points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     return np.asarray(mean + normal_points @ np.linalg.cholesky(cov).T)
+
+
+@numba.njit(cache=True, nogil=True)
+def _accuracies(points: Any, position: Any, covariance: Any, place: Any) -> Any:
+    """Radius of the circle, half the height of the layer, and shape of the smaller ellipsoid."""
+    horizontal = np.empty(len(points))
+    vertical = np.empty(len(points))
+    for n in range(len(points)):
+        x, y = points[n, 0] - position[0], points[n, 1] - position[1]
+        horizontal[n] = x * x + y * y
+        vertical[n] = abs(points[n, 2] - position[2])
+    radius = math.sqrt(np.partition(horizontal, place)[place])
+    half_height = np.partition(vertical, place)[place]
+    best = _scale(_squared_distances(points, position, covariance), place) * covariance
+    whole = _second_moment(points, position) + 1e-9 * covariance
+    other = _scale(_squared_distances(points, position, whole), place) * whole
+    return radius, half_height, other if _determinant(other) < _determinant(best) else best
+
+
+@numba.njit(cache=True, nogil=True)
+def _scale(squared_distances: Any, place: Any) -> Any:
+    """Factor that makes an ellipsoid reach to the point at a place."""
+    return max(np.partition(squared_distances, place)[place], 1e-12)
+
+
+@numba.njit(cache=True, nogil=True)
+def _determinant(a: Any) -> Any:
+    return (
+        a[0, 0] * (a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1])
+        - a[0, 1] * (a[1, 0] * a[2, 2] - a[1, 2] * a[2, 0])
+        + a[0, 2] * (a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0])
+    )
 
 
 @numba.njit(cache=True, nogil=True)

@@ -114,7 +114,8 @@ class Locator:
                 angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=stdev, zenith_stdev=stdev)
                 self.locate(Report(measurements=(angle, length)))
         regions = CredibleRegions(position=np.zeros(3), covariance=np.eye(3), points=np.zeros((1, 3)), share=1.0)
-        regions.ellipsoid(0.5)
+        regions.accuracies(0.5)
+        regions.upright_ellipsoid(0.5)
 
     def _product(self, report: Report) -> Product:
         """Multiply what the measurements say."""

@@ -89,15 +89,16 @@ def fix_to_document(fix: Fix, compute_seconds: float, track: TrackedPosition | N
     ]
     best = candidates[0] if candidates else {"position": None, "covariance_m2": None}
     regions, confidence = fix.regions, fix.confidence
+    accuracies = None if regions is None else regions.accuracies(confidence)
     document = {
         "target_id": fix.target_id,
         "timestamp": fix.timestamp,
         "status": fix.status,
         "position": best["position"],
         "covariance_m2": best["covariance_m2"],
-        "horizontal_accuracy_m": None if regions is None else regions.horizontal_radius(confidence),
-        "vertical_accuracy_m": None if regions is None else regions.vertical_half_height(confidence),
-        "ellipsoid_semi_axes_m": None if regions is None else regions.ellipsoid(confidence).semi_axes.tolist(),
+        "horizontal_accuracy_m": None if accuracies is None else accuracies.horizontal_radius,
+        "vertical_accuracy_m": None if accuracies is None else accuracies.vertical_half_height,
+        "ellipsoid_semi_axes_m": None if accuracies is None else accuracies.ellipsoid.semi_axes.tolist(),
         "confidence": confidence if regions is None else min(confidence, regions.share),
         "candidates": candidates,
         "measurements": [

@@ -31,6 +31,7 @@ class TrackDocument(BaseModel):
 def track_to_document(track: TrackedPosition, confidence: float) -> dict[str, Any]:
     """Turn a track into JSON-compatible data, which :class:`TrackDocument` describes."""
     found = track.estimate
+    accuracies = track.regions.accuracies(confidence)
     return {
         "state": track.state,
         "timestamp": track.timestamp,
@@ -40,6 +41,6 @@ def track_to_document(track: TrackedPosition, confidence: float) -> dict[str, An
         "covariance_m2": found.covariance.tolist(),
         "velocity_m_s": point(found.velocity),
         "velocity_covariance_m2_s2": found.velocity_covariance.tolist(),
-        "horizontal_accuracy_m": track.regions.horizontal_radius(confidence),
-        "vertical_accuracy_m": track.regions.vertical_half_height(confidence),
+        "horizontal_accuracy_m": accuracies.horizontal_radius,
+        "vertical_accuracy_m": accuracies.vertical_half_height,
     }
