@@ -2,16 +2,16 @@
 
 import logging
 import re
-import uuid
 from contextvars import ContextVar
+from secrets import token_hex
 from time import perf_counter
 
-from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rayfix_service.http.metrics import Metrics
 
 HEADER = "X-Request-ID"
+_RAW_HEADER = HEADER.lower().encode()
 
 REQUEST_ID: ContextVar[str | None] = ContextVar("REQUEST_ID", default=None)
 """Identifier of the request under way."""
@@ -34,14 +34,14 @@ class RequestContext:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        identifier = _identifier(Headers(scope=scope).get(HEADER))
+        identifier = _identifier(scope)
         status = "none"  # the client left before the answer
 
         async def send_noting(message: Message) -> None:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = str(message["status"])
-                MutableHeaders(scope=message)[HEADER] = identifier
+                message["headers"] = [*message.get("headers", ()), (_RAW_HEADER, identifier.encode())]
             await send(message)
 
         token = REQUEST_ID.set(identifier)
@@ -66,8 +66,9 @@ class RequestContext:
             REQUEST_ID.reset(token)
 
 
-def _identifier(given: str | None) -> str:
+def _identifier(scope: Scope) -> str:
     """Take the client's identifier where it is fit for a log, else make one."""
-    if given is not None and re.fullmatch(r"[A-Za-z0-9._:/+=-]{1,128}", given):
-        return given
-    return uuid.uuid4().hex
+    given = next((value for name, value in scope["headers"] if name == _RAW_HEADER), None)
+    if given is not None and re.fullmatch(rb"[A-Za-z0-9._:/+=-]{1,128}", given):
+        return bytes(given).decode()
+    return token_hex(16)
