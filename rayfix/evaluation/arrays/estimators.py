@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rayfix.evaluation.arrays.planar import Array, Complex, PlanarArray
 
-_PER_BEAM = 4.0  # points of the search's grid in a beam's width
+_PER_BEAM = 8.0  # points of the search's grid in a beam's width
 _PRECISION = 1e-7  # of the direction cosines at which a search ends
 _LOADING = 1e-6  # share of the mean power that is added to each antenna's, so that MVDR can invert
 
