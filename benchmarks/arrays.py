@@ -41,13 +41,11 @@ def main() -> None:
     options = parser.parse_args()
     with open_or_build(options.table) as table:
         drops = drop_uniformly(table, options.drops, np.random.default_rng([options.seed, 0]))
-        found = {
-            name: angle_errors(drops, table.site.stations, study, np.random.default_rng([options.seed, 1]))
-            for name, study in STUDIES.items()
-        }
-    document = {}
-    for name, errors in found.items():
-        study = STUDIES[name]
+        stations = table.site.stations
+    found, document = {}, {}
+    for name, study in STUDIES.items():
+        errors = angle_errors(drops, stations, study, np.random.default_rng([options.seed, 1]))
+        found[name] = errors
         rows = statistics_rows(study_statistics(errors, study))
         document[name] = rows
         print(f"{name}; outliers are off by more than the beam width of {np.degrees(study.limit):.1f} deg")
@@ -61,7 +59,8 @@ def main() -> None:
             print(
                 f"{row['estimator']:14} {apart[0]:6.2f} {apart[1]:7.2f} {row['outlier_share']:8.1%}"
                 f" {row['other_path_share']:10.1%} {bias['azimuth_deg']:15.3f} {report['azimuth_stdev_deg']:8.3f}"
-                f" {bias['zenith_deg']:12.3f} {report['zenith_stdev_deg']:8.3f}   {tails}"
+                f" {bias['zenith_deg']:12.3f} {report['zenith_stdev_deg']:8.3f}   {tails}",
+                flush=True,
             )
     if options.picture:
         draw_angle_errors(options.picture, {name: (STUDIES[name], errors) for name, errors in found.items()})
