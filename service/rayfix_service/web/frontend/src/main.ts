@@ -1,6 +1,10 @@
 /** Loads the site from the service, or from the page itself, and starts the viewer. */
 
-import "./style.css";
+import "./style/base.css";
+import "./style/drawing.css";
+import "./style/panels.css";
+import "./style/details.css";
+import "./style/screens.css";
 
 import { Api, ServiceError } from "./api";
 import { decodeBase64, embeddedData } from "./embedded";

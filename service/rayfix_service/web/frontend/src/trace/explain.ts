@@ -34,6 +34,7 @@ export interface Explanation {
 const RAYS = { disc: 160, azimuths: 11, zeniths: 90, sphere: 4000 };
 const REACH = 3; // standard deviations
 const WORST = 60; // squared misfit of what still explains anything
+const SHORTER = 1e-6; // of misfit for each metre: of paths that fit alike the shorter one, which is the stronger, is told
 const GOLDEN = Math.PI * (3 - Math.sqrt(5));
 
 export function explain(
@@ -87,7 +88,7 @@ function consider(
 }
 
 function misfitOf(heard: Heard, azimuth: number, zenith: number, total: number): number {
-  let sum = 0;
+  let sum = SHORTER * total;
   if (heard.azimuth !== null) sum += (wrap(azimuth - heard.azimuth) / heard.azimuthStdev) ** 2;
   if (heard.zenith !== null) sum += ((zenith - heard.zenith) / heard.zenithStdev) ** 2;
   if (heard.length !== null) sum += ((total - heard.length) / heard.lengthStdev) ** 2;
