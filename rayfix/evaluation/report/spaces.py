@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.proj3d import proj_transform
 from numpy.typing import NDArray
 
 from rayfix.evaluation.report.geometry import Backdrop, ellipsoids, unit_sphere
@@ -21,6 +22,8 @@ TRUTH, FIX, ESTIMATE = "#1a936f", "#d1495b", "#7c3aed"
 """Colours of the true position, of rayfix's and of the paper's method's."""
 
 _SOLID = "#9aa3af"
+_ROOM, _MIDDLE = np.array([0.92, 0.76]), np.array([0.5, 0.52])
+"""Share of a figure that a space takes up, and where its middle is."""
 
 
 def space_picture(scene: Backdrop, pictures: Pictures, show: str) -> Figure:
@@ -31,8 +34,12 @@ def space_picture(scene: Backdrop, pictures: Pictures, show: str) -> Figure:
     show : {"scene", "points_aoa", "points_pt", "mixture_aoa", "mixture_pt"}
         What is in it besides stations and the transmitter: the reported paths, points on rays, or fitted mixtures.
     """
-    figure = new_figure(8.6, 4.9)
-    axes: Any = figure.add_subplot(projection="3d")
+    width, height = 8.8, 4.6
+    figure = new_figure(width, height)
+    figure.set_layout_engine("none")
+    # A space is drawn into a square and cut at its sides: one as wide as the figure, more than as high.
+    tall = width / height
+    axes: Any = figure.add_axes((0.0, 0.5 - 0.5 * tall, 1.0, tall), projection="3d")
     extent = scene.high - scene.low
     # The longer horizontal axis runs along the page.
     swap = extent[1] > extent[0]
@@ -70,10 +77,10 @@ def space_picture(scene: Backdrop, pictures: Pictures, show: str) -> Figure:
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_zlim(low[2], high[2])
-    axes.set_box_aspect(high - low, zoom=1.32)
     axes.view_init(elev=32, azim=-62)
     axes.set_axis_off()
-    figure.legend(loc="outside lower center", ncols=3)
+    _fit(axes, high - low, placed(scene.box_edges()).reshape(-1, 3))
+    figure.legend(loc="lower center", ncols=3)
     return figure
 
 
@@ -115,6 +122,20 @@ def plane_picture(scene: Backdrop, pictures: Pictures) -> Figure:
     axes.set_ylabel(f"{'xy'[pick[1]]} [m]")
     figure.legend(loc="outside lower center", ncols=2)
     return figure
+
+
+def _fit(axes: Any, extent: Array, corners: Array) -> None:
+    """Zoom and move a space so that its corners fill the figure above the legend."""
+    axes.set_box_aspect(extent)
+    for zoom in (1.0, None):
+        x, y, _ = proj_transform(*corners.T, axes.get_proj())
+        spots = axes.figure.transFigure.inverted().transform(axes.transData.transform(np.stack([x, y], axis=-1)))
+        low, high = spots.min(axis=0), spots.max(axis=0)
+        if zoom is not None:
+            axes.set_box_aspect(extent, zoom=zoom * float(np.min(_ROOM / (high - low))))
+    box = axes.get_position(original=True)
+    shift = _MIDDLE - 0.5 * (low + high)
+    axes.set_position((box.x0 + shift[0], box.y0 + shift[1], box.width, box.height))
 
 
 def _draw_ellipsoids(axes: Any, mixture: Any, colour: str, placed: Any) -> None:

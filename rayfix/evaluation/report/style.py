@@ -103,6 +103,9 @@ def write_figure(figure: Figure, stem: Path) -> None:
     try:
         stem.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(stem.with_suffix(".svg"), metadata={"Date": None}, dpi=110)
+        drawn = stem.with_suffix(".svg").read_text(encoding="utf-8")
+        # A hundredth of a point is enough, and half of the file.
+        stem.with_suffix(".svg").write_text(re.sub(r"(\d\.\d\d)\d+", r"\1", drawn), encoding="utf-8")
         figure.savefig(stem.with_suffix(".png"), dpi=140)
     except OSError as error:
         raise RayfixError(f"cannot write {stem}.svg: {error.strerror}; choose another folder with -o") from error

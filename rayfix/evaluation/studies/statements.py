@@ -77,7 +77,7 @@ def _propagation_times_help(runs: Mapping[tuple[str, str, str], Run], method: st
         claim="Propagation times help strongly at 1 deg.",
         method=method,
         holds=holds,
-        figures=f"90th percentile {_cm(before)} without, {_cm(after)} with PT 0.5 m; lower with in {share:.0%} of "
+        figures=f"90th percentile {_cm(before)} without, {_cm(after)} with PT 0.5 m; lower in {share:.0%} of "
         "bootstrap resamples",
         reason=reason,
     )
@@ -112,7 +112,8 @@ def _relative_times_help_less(runs: Mapping[tuple[str, str, str], Run], method: 
     reason = ""
     if not holds:
         reason = (
-            "With rayfix both are little better than angles alone, and within the scatter of each other."
+            "The two are within the scatter of each other; RPT 0.5 m comes of times that are better than PT 0.5 m by a "
+            "factor of the square root of two."
             if share > 1.0 - _SURE
             else "A difference says of two stations at once which of their paths belong together, which rayfix uses in "
             "full; and RPT 0.5 m comes of times that are better than PT 0.5 m, by a factor of the square root of two."
@@ -140,7 +141,7 @@ def _ahead(runs: Mapping[tuple[str, str, str], Run], seed: int) -> Statement:
             count += 1
             name = f"{point} ({percent}th)"
             if percentile(ours.error, percent) >= percentile(theirs.error, percent):
-                behind.append(name)
+                behind.append(f"{name}, in {1.0 - probability_lower(ours, theirs, percent, seed):.0%} of resamples")
             elif probability_lower(ours, theirs, percent, seed) < _SURE:
                 unsure.append(name)
     figures = f"{count - len(behind)} of {count} percentiles are lower"
@@ -152,7 +153,7 @@ def _ahead(runs: Mapping[tuple[str, str, str], Run], seed: int) -> Statement:
         method="rayfix",
         holds=not behind,
         figures=figures,
-        reason=f"Behind at: {', '.join(behind)}." if behind else "",
+        reason=f"Not ahead at: {'; '.join(behind)}." if behind else "",
     )
 
 
