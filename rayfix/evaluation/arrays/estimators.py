@@ -14,6 +14,7 @@ from rayfix.evaluation.arrays.planar import Array, Complex, PlanarArray
 
 _PER_BEAM = 8.0  # points of the search's grid in a beam's width
 _PRECISION = 1e-7  # of the direction cosines at which a search ends
+_MOST_STEPS = 300  # of a search, which on a flat top would go on by what rounding makes higher
 _LOADING = 1e-6  # share of the mean power that is added to each antenna's, so that MVDR can invert
 
 
@@ -198,7 +199,9 @@ def _climb(form: _Form, starts: Array, step: float) -> Array:
     offsets = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 2)
     points = starts.copy()
     widths = np.full(len(points), step)
-    while (widths > _PRECISION).any():
+    for _ in range(_MOST_STEPS):
+        if (widths <= _PRECISION).all():
+            break
         around = points[:, None] + widths[:, None, None] * offsets
         length = np.linalg.norm(around, axis=-1, keepdims=True)
         around = np.where(length < 1.0, around, around / np.maximum(length, 1.0))
