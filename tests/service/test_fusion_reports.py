@@ -413,3 +413,10 @@ def test_an_unknown_station_is_refused_with_its_place(measurement: Measurement, 
     with pytest.raises(ReportError, match="station 'x' is not in the table; it has a, b, c, d") as caught:
         sort(angle("a"), measurement)
     assert caught.value.path == ("measurements", 1, field)
+
+
+def test_a_difference_between_two_lost_arrivals_may_connect_the_others() -> None:
+    """Of c - a - b - d the clock is that of c and d; a and b are far from it, and what connects them is used."""
+    found = sort(tdoa("a", "b", 0.0), tdoa("a", "c", 1e4), tdoa("b", "d", 1e4))
+    assert not found.unused
+    assert {o.station_id: o.differences for o in found.observations} == {"c": (1, 0), "d": (2, 0)}

@@ -106,14 +106,18 @@ def read_clocks(clocks: Sequence[Sequence[Arrival]], max_path_length: float) -> 
         near = _near_each_other(clock, max_path_length)
         if len({row.station_id for row in near}) < 2:
             near = []
+        without_effect = _without_effect(clock, near)
+        # A difference between two lost arrivals may connect those that are left, all of which then hang on it.
+        own = without_effect.union(*(row.differences for row in near))
+        linking = tuple(sorted({index for row in clock for index in row.differences} - own))
         for row in near:
             reading = ClockReading(
                 clock=num_clocks, offset=row.offset, variance=row.variance, spreads=spreads(row.error_model)
             )
-            readings.append((row, reading))
+            readings.append((replace(row, differences=(*row.differences, *linking)), reading))
         num_clocks += bool(near)
         reason = ALONE if len({row.station_id for row in clock}) == 1 else FAR
-        unused.update(dict.fromkeys(_without_effect(clock, near), reason))
+        unused.update(dict.fromkeys(without_effect, reason))
     return Clocks(readings=tuple(readings), num_clocks=num_clocks, unused=unused)
 
 
