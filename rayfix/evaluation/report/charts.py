@@ -13,12 +13,14 @@ from rayfix.evaluation.report.style import GRID, INK, METHOD_COLOURS, MUTED, SER
 from rayfix.evaluation.studies.methods import METHODS
 
 __all__ = [
+    "arrays_chart",
     "calibration_chart",
     "cdf_by_noise",
     "curve_chart",
     "differences_chart",
     "methods_cdf",
     "percentiles_chart",
+    "reflections_chart",
 ]
 
 Document = Mapping[str, Any]
@@ -225,6 +227,25 @@ def differences_chart(document: Document) -> Figure:
     axes.tick_params(length=0)
     for spine in axes.spines.values():
         spine.set_visible(False)
+    return figure
+
+
+def arrays_chart(arrays: Sequence[Document]) -> Figure:
+    """Distributions of the angle between the estimated and the strongest path's direction, a panel for each array."""
+    figure = new_figure(4.8 * len(arrays), 3.7)
+    panels = figure.subplots(1, len(arrays), sharey=True, squeeze=False)[0]
+    for axes, array in zip(panels, arrays, strict=True):
+        for colour, (name, found) in zip(SERIES, array["estimators"].items(), strict=False):
+            apart = np.array(found["apart_deg"])
+            axes.step(apart, np.arange(1, len(apart) + 1) / max(len(apart), 1), color=colour, label=name, where="post")
+        axes.axvline(array["beam_width_deg"], color=MUTED, linewidth=1.0, linestyle=":")
+        axes.set_xscale("log")
+        axes.set_xlim(0.01, 180.0)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.set_xlabel("angle to the strongest path [deg]")
+        axes.set_title(f"{array['label']}, {array['snr_db']:g} dB")
+        percent_axis(axes)
+        axes.legend(loc="upper left")
     return figure
 
 

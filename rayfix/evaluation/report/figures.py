@@ -8,6 +8,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from rayfix.evaluation.report.charts import (
+    arrays_chart,
     calibration_chart,
     cdf_by_noise,
     curve_chart,
@@ -72,6 +73,7 @@ def figure_specs(evaluation: Evaluation) -> tuple[Spec, ...]:
         *_cdf_specs(evaluation.results),
         *_method_specs(evaluation.results),
         _planning_spec(evaluation.results, scene),
+        _arrays_spec(evaluation.results),
         *(_stress_spec(study) for study in evaluation.results["studies"] if study["key"].startswith("stress-")),
     ]
     return tuple(specs)
@@ -249,6 +251,18 @@ def _planning_spec(results: Document, scene: Backdrop) -> Spec:
         f"squares of {planning['spacing_m']:g} m; triangles are stations, lines what the plane cuts. {figures}. "
         "'rayfix plan' draws such maps for other heights and noise, and beside those of a station added or moved.",
         draw=lambda: planning_chart(scene, planning),
+    )
+
+
+def _arrays_spec(results: Document) -> Spec:
+    arrays = results["antenna_arrays"]
+    return Spec(
+        key="antenna-arrays",
+        title="Angle errors of antenna arrays",
+        caption="Uniform planar arrays at the stations receive all paths of the forward solver, and four estimators "
+        "look for the strongest. Dotted: the half-power beam width; beyond it, an angle is that of another path or of "
+        "none.",
+        draw=lambda: arrays_chart(arrays),
     )
 
 

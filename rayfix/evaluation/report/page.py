@@ -25,6 +25,7 @@ _SECTIONS = (
     ("methods", "Methods side by side"),
     ("calibration", "Stated and true uncertainty"),
     ("planning", "Over the floor"),
+    ("arrays", "Where angles come from"),
     ("stress", "When things are wrong"),
     ("made", "How this was made"),
 )
@@ -66,6 +67,7 @@ def render_page(
         "methods": _methods(evaluation, by_key),
         "calibration": _calibration(results) + by_key["calibration"],
         "planning": _planning(by_key),
+        "arrays": _arrays(results) + by_key["antenna-arrays"],
         "stress": _stress(by_key, specs),
         "made": _made(results, command),
     }
@@ -261,6 +263,38 @@ def _planning(by_key: Mapping[str, str]) -> str:
         "forward "
         "solver: the table says what each station would hear of a place, and the same table locates it.</p>"
         + by_key["planning"]
+    )
+
+
+def _arrays(results: Document) -> str:
+    rows = []
+    for array in results["antenna_arrays"]:
+        rows.append(f'<tr class="group"><td colspan="7">{escape(array["label"])}, {array["snr_db"]:g} dB</td></tr>')
+        for name, found in array["estimators"].items():
+            statistics = found["statistics"]
+            cells = [_number(found["p50_deg"]), _number(found["p90_deg"]), *(6 - 2) * [""]]
+            if statistics is not None:
+                report = statistics["report"]
+                tails = (
+                    f"{share(report['tail_share'])} x {report['tail_scale']:.1f}" if "tail_share" in report else "none"
+                )
+                cells[2:] = [
+                    share(statistics["outlier_share"]),
+                    f"{report['azimuth_stdev_deg']:.2f}",
+                    f"{report['zenith_stdev_deg']:.2f}",
+                    tails,
+                ]
+            rows.append(f"<tr><td>{escape(name)}</td>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
+    return (
+        "<p>The paper lists four estimators as sources of angles, each with statistics of its own. These are theirs in "
+        "this scene, in the form that a report states them: a deviation and, where errors have tails, the share and "
+        "the "
+        "width of a second, wider Gaussian. Angles off by more than a beam width are outliers, which rayfix expects, "
+        "and "
+        "are left out of the deviations.</p>"
+        '<div class="scroll"><table><caption>Angle between the estimated direction and that of the strongest path, deg.'
+        "</caption><thead><tr><th></th><th>50th</th><th>90th</th><th>outliers</th><th>azimuth<br>stdev</th>"
+        f"<th>zenith<br>stdev</th><th>tails</th></tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
     )
 
 

@@ -24,6 +24,8 @@ class Effort:
         Drops of the figures of the paper and of the methods side by side.
     stress_drops : int
         Drops of each point of a curve.
+    array_drops : int
+        Drops of the angle errors of antenna arrays.
     coarse : bool
         Whether tables of other path priors have wide windows only.
     map_spacing : float, m
@@ -33,12 +35,13 @@ class Effort:
     name: str
     drops: int
     stress_drops: int
+    array_drops: int
     coarse: bool
     map_spacing: float
 
 
-QUICK = Effort(name="quick", drops=24, stress_drops=24, coarse=True, map_spacing=1.0)
-FULL = Effort(name="full", drops=300, stress_drops=150, coarse=False, map_spacing=0.5)
+QUICK = Effort(name="quick", drops=24, stress_drops=24, array_drops=8, coarse=True, map_spacing=1.0)
+FULL = Effort(name="full", drops=300, stress_drops=150, array_drops=60, coarse=False, map_spacing=0.5)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix.evaluation.rivals.fingerprints import simulate_map
+from rayfix.evaluation.studies.arrays import study_arrays
 from rayfix.evaluation.studies.bench import Bench, BenchSettings
 from rayfix.evaluation.studies.cases import Case, World, document_key
 from rayfix.evaluation.studies.catalogue import Effort, Study, studies
@@ -119,6 +120,7 @@ def evaluate_site(
     )
     drops = runner.drops()
     runner.run_all(planned, drops["heard"])
+    array_drops = drops["heard"][: effort.array_drops]
     pictures = runner.stored("pictures", {}, lambda: draw_pictures(Bench(settings), drops["heard"], seed))
     results = {
         "format": "rayfix-evaluation",
@@ -138,6 +140,9 @@ def evaluate_site(
         "planning": runner.stored(
             "planning", {"spacing": effort.map_spacing}, lambda: plan_site(table, spacing=effort.map_spacing, seed=seed)
         ),
+        "antenna_arrays": runner.stored(
+            "antenna arrays", {"drops": array_drops}, lambda: _arrays(Bench(settings), array_drops, seed)
+        ),
     }
     timings = {
         "cores": os.cpu_count(),
@@ -145,6 +150,10 @@ def evaluate_site(
         "studies": {study.key: runner.timing_document(study, drops["heard"]) for study in planned},
     }
     return Evaluation(results=results, timings=timings, pictures=pictures, table=table)
+
+
+def _arrays(bench: Bench, numbers: Sequence[int], seed: int) -> list[dict[str, Any]]:
+    return study_arrays([bench.drop(World(), n) for n in numbers], bench.table.site.stations, seed=seed)
 
 
 @dataclass(frozen=True, kw_only=True)

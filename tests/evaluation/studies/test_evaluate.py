@@ -79,7 +79,7 @@ def test_every_figure_is_there_and_the_page_needs_nothing_else(evaluated: Path) 
     drawn = {path.stem for path in (evaluated / "figures").glob("*.svg")}
     assert drawn == {path.stem for path in (evaluated / "figures").glob("*.png")}
     assert drawn >= PAPER_FIGURES
-    assert {"methods-cdf", "methods-percentiles", "calibration"} <= drawn
+    assert {"methods-cdf", "methods-percentiles", "calibration", "planning", "antenna-arrays"} <= drawn
     for key in drawn:
         assert f'<figure id="{key}">' in page
     for key in PAPER_FIGURES & {"scene", "points-aoa", "mixture-aoa", "points-aoa-pt", "mixture-aoa-pt"}:
