@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import yaml
 
-from rayfix.cli import _parser
+from rayfix.cli import make_parser
 from rayfix_service.http.keys import read_key_file
 
 helm_python = pytest.importorskip("helm_python", reason="Helm's library has no wheel for this machine")
@@ -118,7 +118,7 @@ def test_pods_are_confined_and_their_commands_are_rayfix(values: dict[str, Any])
                 script = Path(container["command"][1])
                 assert (CHART.parents[1] / "image" / script.name).is_file()
             else:
-                options = _parser().parse_args(container["args"])
+                options = make_parser().parse_args(container["args"])
                 assert str(options.tables) == pod["initContainers"][0]["args"][-1]
                 assert any(options.api_keys.is_relative_to(mount["mountPath"]) for mount in container["volumeMounts"])
 

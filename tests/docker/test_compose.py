@@ -11,7 +11,7 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from imagetest.composition import HONOURED, WITHOUT_ENGINE, Composition
-from rayfix.cli import _parser
+from rayfix.cli import make_parser
 from rayfix_service.fusion.report import Status
 from rayfix_service.http.keys import ApiKeys
 from rayfix_service.http.metrics import Metrics
@@ -56,9 +56,9 @@ def test_every_key_is_known(services: dict[str, Any]):
 
 
 def test_the_commands_are_those_of_the_command_line(services: dict[str, Any]):
-    options = _parser().parse_args(services["service"]["command"])
+    options = make_parser().parse_args(services["service"]["command"])
     assert (options.host, options.port, options.api_keys) == ("0.0.0.0", 8000, Path("/run/secrets/api_keys"))
-    options = _parser().parse_args(services["mqtt"]["command"])
+    options = make_parser().parse_args(services["mqtt"]["command"])
     assert options.broker in services["mqtt"]["depends_on"]
 
 

@@ -1,24 +1,16 @@
-"""The commands that make pictures: ``rayfix view`` and ``rayfix plot``."""
+"""Pictures: ``rayfix view`` and ``rayfix plot``."""
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 
+from rayfix.commands.arguments import AddCommand
 from rayfix.extras import needs_extra
 
 _LAYERS = ("rays", "points", "mixture", "posterior", "fix")
 
-AddCommand = Callable[[str, Callable[[argparse.Namespace], int], str], argparse.ArgumentParser]
 
-
-def add_picture_commands(add: AddCommand) -> None:
-    """Add the commands to the command line.
-
-    Parameters
-    ----------
-    add : callable
-        Makes a command of a name, what it runs, and what it does in words.
-    """
+def add_commands(add: AddCommand) -> None:
+    """Add the commands to the command line."""
     view = add("view", _view, "write the viewer with a site and the fixes of a file into one HTML page")
     view.add_argument("table", type=Path, metavar="T.h5")
     view.add_argument("report", type=Path, nargs="?", metavar="REPORT.json", help="a report, or {'reports': [...]}")

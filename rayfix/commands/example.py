@@ -1,0 +1,33 @@
+"""The bundled hall: ``rayfix demo`` and ``rayfix example``."""
+
+import argparse
+from pathlib import Path
+
+from rayfix.commands.arguments import AddCommand, job_count
+from rayfix.extras import needs_extra
+
+
+def add_commands(add: AddCommand) -> None:
+    """Add the commands to the command line."""
+    demo = add("demo", _demo, "run the whole main job on the bundled hall and draw a picture of the fix")
+    demo.add_argument("-o", "--output", type=Path, default=Path("demo"), metavar="DIR", help="folder (default: demo)")
+    demo.add_argument("--jobs", type=job_count, default=-1, help="cells fitted at a time (default: one per core)")
+
+    example = add("example", _example, "write the bundled hall: hall.glb, site.toml, report.json")
+    example.add_argument("folder", type=Path, metavar="DIR")
+
+
+def _demo(options: argparse.Namespace) -> int:
+    with needs_extra("all"):
+        from rayfix.demo import run_demo
+    run_demo(options.output, jobs=options.jobs)
+    return 0
+
+
+def _example(options: argparse.Namespace) -> int:
+    with needs_extra("offline"):
+        from rayfix.example.files import write_example
+
+        site = write_example(options.folder)
+    print(f"Wrote {site} with its scene and a report. Next: rayfix build {site} -o {options.folder / 'hall.h5'}")
+    return 0

@@ -1,0 +1,96 @@
+"""Positions: ``rayfix locate`` and ``rayfix mqtt``."""
+
+import argparse
+import json
+import os
+from pathlib import Path
+
+from rayfix.commands.arguments import AddCommand, add_hub_argument, add_output_arguments, hub_settings
+from rayfix.extras import needs_extra
+
+_INPUTS = ("native", "nrppa", "silabs", "ublox")
+_PASSWORD_VARIABLE = "RAYFIX_MQTT_PASSWORD"  # not an argument, which other users of the machine could read
+
+
+def add_commands(add: AddCommand) -> None:
+    """Add the commands to the command line."""
+    locate = add("locate", _locate, "locate the reports of a file")
+    locate.add_argument("table", type=Path, metavar="T.h5")
+    locate.add_argument("report", type=Path, metavar="REPORT.json")
+    locate.add_argument("--format", choices=_INPUTS, default="native", help="format of the report (default: native)")
+    add_output_arguments(locate)
+    locate.add_argument("--json", action="store_true", help="the answer of the HTTP interface")
+
+    mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: angles of Silicon Labs locators in, positions out")
+    mqtt.add_argument("table", type=Path, metavar="T.h5")
+    mqtt.add_argument("--broker", default="localhost", metavar="HOST[:PORT]", help="(default: localhost)")
+    mqtt.add_argument(
+        "--topic",
+        default="silabs/aoa/angle/+/+",
+        help="angles to read, of topics that end in LOCATOR/TAG (default: silabs/aoa/angle/+/+)",
+    )
+    mqtt.add_argument(
+        "--publish",
+        default="rayfix/position/{target_id}",
+        metavar="TOPIC",
+        help="topic of positions (default: rayfix/position/{target_id})",
+    )
+    add_output_arguments(mqtt)
+    mqtt.add_argument(
+        "--window", type=float, default=0.5, help="seconds that a packet waits for more locators (default: 0.5)"
+    )
+    mqtt.add_argument("--frame", choices=("lcs", "scene", "north"), default="lcs", help="of the angles (default: lcs)")
+    mqtt.add_argument("--track", action="store_true", help="follow tags from packet to packet")
+    add_hub_argument(mqtt)
+    mqtt.add_argument("--tls", action="store_true", help="encrypt; the port is then 8883 unless given")
+    mqtt.add_argument("--username", help=f"the password is taken from the environment variable {_PASSWORD_VARIABLE}")
+
+
+def _locate(options: argparse.Namespace) -> int:
+    with needs_extra("service"):
+        from rayfix.console import print_fix
+        from rayfix.locate import locate_file
+        from rayfix_service.adapters.adapted import known_height, station_map
+    answers = locate_file(
+        options.table,
+        options.report,
+        input_format=options.format,
+        output_format=options.output,
+        stations=station_map(options.station),
+        height=known_height(*(options.height or (None, None))),
+    )
+    for document in answers:
+        if options.json or options.output != "native":
+            # Several are one a line, which is what programs read.
+            print(json.dumps(document, indent=2 if len(answers) == 1 else None))
+        else:
+            if len(answers) > 1:
+                print(f"{document['target_id']}:")
+            print_fix(document)
+    return 0
+
+
+def _mqtt(options: argparse.Namespace) -> int:
+    with needs_extra("mqtt"):
+        from rayfix.mqtt import serve_mqtt
+        from rayfix_service.adapters.adapted import known_height, station_map
+        from rayfix_service.adapters.mqtt import MqttSettings, parse_broker
+    broker = parse_broker(
+        options.broker,
+        tls=options.tls,
+        username=options.username,
+        password=os.environ.get(_PASSWORD_VARIABLE),
+    )
+    settings = MqttSettings(
+        topic=options.topic,
+        publish=options.publish,
+        output=options.output,
+        window=options.window,
+        stations=station_map(options.station),
+        frame=options.frame,
+        height=known_height(*(options.height or (None, None))),
+        track=options.track,
+        hub=hub_settings(options),
+    )
+    serve_mqtt(options.table, broker, settings)
+    return 0

@@ -1,0 +1,75 @@
+"""The service: ``rayfix serve`` and ``rayfix api-key``."""
+
+import argparse
+from pathlib import Path
+
+from rayfix.commands.arguments import AddCommand, add_hub_argument, hub_settings, report_rate
+from rayfix.extras import needs_extra
+
+
+def add_commands(add: AddCommand) -> None:
+    """Add the commands to the command line."""
+    serve = add("serve", _serve, "serve a table, or all tables of a folder, over HTTP")
+    serve.add_argument("tables", type=Path, metavar="T.h5|DIR")
+    serve.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
+    serve.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
+    serve.add_argument("--workers", type=int, default=1, help="processes that answer (default: 1)")
+    serve.add_argument("--log-format", choices=("text", "json"), default="text", help="of the log (default: text)")
+    serve.add_argument("--access-log", action="store_true", help="log a line per request")
+    serve.add_argument("--track", action="store_true", help="follow targets unless a request says otherwise")
+    add_hub_argument(serve)
+    serve.add_argument(
+        "--allow-simulation",
+        action="store_true",
+        help="let the viewer simulate reports (on a loopback address it always may)",
+    )
+    serve.add_argument(
+        "--api-keys", type=Path, metavar="FILE", help="keys to ask for; needed unless only this machine can reach HOST"
+    )
+    serve.add_argument(
+        "--rate-limit",
+        type=report_rate,
+        metavar="N",
+        help="reports that each key may send a second (default: no limit)",
+    )
+    serve.add_argument(
+        "--cors-origin",
+        action="append",
+        default=[],
+        metavar="ORIGIN",
+        help="let pages of this origin, e.g. https://maps.example.com, call from browsers; may be given several times",
+    )
+
+    api_key = add("api-key", _api_key, "make an API key, print it once, and add its hash to a key file")
+    api_key.add_argument("name", metavar="NAME", help="whose it is")
+    api_key.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="key file, made if need be")
+
+
+def _serve(options: argparse.Namespace) -> int:
+    with needs_extra("service"):
+        from rayfix_service.http.server import is_loopback, serve
+        from rayfix_service.http.settings import ServiceSettings
+    serve(
+        options.tables,
+        host=options.host,
+        port=options.port,
+        workers=options.workers,
+        log_format=options.log_format,
+        access_log=options.access_log,
+        settings=ServiceSettings(
+            api_keys=options.api_keys,
+            reports_per_second=options.rate_limit,
+            cors_origins=tuple(options.cors_origin),
+            track=options.track,
+            hub=hub_settings(options),
+            simulation=options.allow_simulation or is_loopback(options.host),
+        ),
+    )
+    return 0
+
+
+def _api_key(options: argparse.Namespace) -> int:
+    with needs_extra("service"):
+        from rayfix_service.http.keys import add_key
+    print(add_key(options.output, options.name))
+    return 0
