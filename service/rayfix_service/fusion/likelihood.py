@@ -85,6 +85,8 @@ def log_normal_terms(value: float, log_stdev: float) -> tuple[Term, ...]:
 
 def total_variance(terms: Sequence[Term]) -> float:
     """Variance of the path length, m2, over all terms."""
+    if len(terms) == 1:  # as most are
+        return terms[0].variance
     weights = [math.exp(term.log_weight) for term in terms]
     total = sum(weights)
     mean = sum(w * term.value for w, term in zip(weights, terms, strict=True)) / total
@@ -99,6 +101,8 @@ def product(terms: Sequence[Term], shared_variance: float) -> Term:
     terms : sequence of Term
         At least one.
     """
+    if len(terms) == 1:
+        return terms[0]._replace(variance=terms[0].variance + shared_variance)
     precision = sum(1.0 / term.variance for term in terms)
     value = sum(term.value / term.variance for term in terms) / precision
     log_weight = 0.5 * (_LOG_2PI - math.log(precision))
