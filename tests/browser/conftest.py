@@ -1,21 +1,14 @@
 """A real browser on a real service. The tests skip where there is no Chromium or the viewer is not built."""
 
-import re
 import shutil
-import signal
-import subprocess
-import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from rayfix_service.web.assets import load_assets
+from tests.support.server_process import start_rayfix_serve
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
@@ -31,61 +24,6 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-
-
-class Service:
-    """``rayfix serve`` in a process of its own, on a free port."""
-
-    def __init__(self, *arguments: str | Path) -> None:
-        command = [sys.executable, "-m", "rayfix", "serve", *map(str, arguments), "--port", "0"]
-        self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-        self.log: list[str] = []
-        self._listening = threading.Event()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            self.log.append(line)
-            if "running on http://" in line:
-                self._listening.set()
-
-    def url(self) -> str:
-        """Address, once it is ready."""
-        assert self._listening.wait(60), "".join(self.log)
-        url = next(found for line in self.log for found in re.findall(r"http://127\.0\.0\.1:\d+", line))
-        deadline = time.monotonic() + 120
-        while httpx.get(f"{url}/readyz", trust_env=False, timeout=10).status_code != 200:
-            assert time.monotonic() < deadline, "".join(self.log)
-            time.sleep(0.1)
-        return url
-
-    def stop(self) -> None:
-        """End it."""
-        self.process.send_signal(signal.SIGTERM)
-        try:
-            self.process.wait(20)
-        finally:
-            self.process.kill()
-            self._reader.join(10)
-            assert self.process.stderr is not None
-            self.process.stderr.close()
-
-
-@pytest.fixture(scope="session")
-def serve() -> Callable[..., Any]:
-    """Return the context that serves a table and gives the address."""
-
-    @contextmanager
-    def serving(*arguments: str | Path) -> Iterator[str]:
-        service = Service(*arguments)
-        try:
-            yield service.url()
-        finally:
-            service.stop()
-
-    return serving
 
 
 @pytest.fixture(scope="session")
@@ -110,10 +48,10 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="session")
-def hall_url(hall_table_path: Path, browser: Any, serve: Callable[..., Any]) -> Iterator[str]:
+def hall_url(hall_table_path: Path, browser: Any) -> Iterator[str]:
     """Address of a service of the small table of the hall."""
-    with serve(hall_table_path) as url:
-        yield url
+    with start_rayfix_serve(hall_table_path) as server:
+        yield server.url
 
 
 @pytest.fixture

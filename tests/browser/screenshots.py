@@ -20,6 +20,7 @@ from rayfix.example.drop import EXAMPLE_NOISE
 from rayfix.example.files import write_example
 from rayfix.example.hall import hall_scene, hall_stations
 from rayfix_offline.build import build_table
+from tests.support.server_process import start_rayfix_serve
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -27,15 +28,15 @@ HIDDEN = np.array([4.7, 6.2, 0.9])
 
 
 @pytest.fixture(scope="module")
-def url(browser: Any, serve: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def url(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a service of the hall's full table, that of the demo where it was run."""
     table = ROOT / "demo" / "hall.h5"
     if not table.is_file():
         folder = tmp_path_factory.mktemp("hall")
         table = folder / "hall.h5"
         build_table(write_example(folder), table)
-    with serve(table) as address:
-        yield address
+    with start_rayfix_serve(table) as server:
+        yield server.url
 
 
 def hidden_report() -> dict[str, Any]:

@@ -17,6 +17,7 @@ from rayfix.evaluation.forward import ForwardSolver
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths, report_text, simulate_example_report
 from rayfix.example.hall import hall_scene, hall_stations
 from rayfix_service.http.keys import add_key
+from tests.support.server_process import start_rayfix_serve
 
 expect = pytest.importorskip("playwright.sync_api", reason="playwright is not installed").expect
 
@@ -237,14 +238,12 @@ def test_a_page_from_disk_shows_its_fix(
     assert page.evaluate(f"({PATHS})().length") >= 3
 
 
-def test_a_key_is_asked_for_and_sent(
-    browser: Any, serve: Callable[..., Any], hall_table_path: Path, tmp_path: Path, artefacts: Path
-):
+def test_a_key_is_asked_for_and_sent(browser: Any, hall_table_path: Path, tmp_path: Path, artefacts: Path):
     """Refusals are logged by the browser, so this page is not one of those that may log nothing."""
     key = add_key(tmp_path / "keys", "viewer")
-    with serve(hall_table_path, "--api-keys", tmp_path / "keys") as url:
+    with start_rayfix_serve(hall_table_path, "--api-keys", tmp_path / "keys") as server:
         page = browser.new_page(viewport={"width": 1280, "height": 720})
-        page.goto(url)
+        page.goto(server.url)
         page.wait_for_selector("text=The service asks for a key")
         page.screenshot(path=artefacts / "key.png")
         for text, then in (("wrong", "text=does not know this key"), (key, "html[data-ready]")):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from rayfix_offline.build import build_table
+from tests.support.server_process import start_rayfix_serve
 
 TARGETS, HERTZ, SECONDS = 20, 5.0, 6.0
 
@@ -86,16 +87,15 @@ def driving(url: str) -> Iterator[list[float]]:
 @pytest.mark.slow
 def test_a_warehouse_with_twenty_live_targets_stays_responsive(
     open_page: Callable[..., Any],
-    serve: Callable[..., Any],
     warehouse_table_path: Path,
     artefacts: Path,
 ):
     """Frame times are those of software rendering on the processor that also makes the fixes; they go to a file."""
-    with serve(warehouse_table_path) as url:
-        page = open_page(url)
+    with start_rayfix_serve(warehouse_table_path) as server:
+        page = open_page(server.url)
         first_view = page.evaluate("performance.getEntriesByName('rayfix-ready')[0].startTime")
         page.wait_for_selector("#connection.live")
-        with driving(url) as took:
+        with driving(server.url) as took:
             page.wait_for_selector("li[role=option]:nth-child(20)")
             page.wait_for_timeout(1500)
             before = page.evaluate(

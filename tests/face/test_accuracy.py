@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-import anyio
 import httpx
 import numpy as np
 import pytest
@@ -13,9 +12,9 @@ from rayfix.evaluation.simulate import Noise, Timing, simulate_report
 from rayfix.example.files import write_example
 from rayfix_offline.build import build_table
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.http.app import create_app
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Table
+from tests.support.running_app import RunningApp
 
 
 @pytest.fixture(scope="module")
@@ -106,26 +105,12 @@ def test_reports_from_a_real_warehouse_are_located(warehouse_table: Table) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.anyio
-async def test_the_warehouse_is_served(warehouse_table: Table) -> None:
+def test_the_warehouse_is_served(warehouse_table: Table) -> None:
     drop = drop_uniformly(warehouse_table, 1, np.random.default_rng(8), max_height=2.0)[0]
     noise = Noise(azimuth_stdev=0.02, zenith_stdev=0.02, range_stdev=0.5)
     report = simulate_report(drop.paths, noise, rng=np.random.default_rng(9))
-    app = create_app(warehouse_table.path)
-    async with app.router.lifespan_context(app):
-        transport = httpx.ASGITransport(app=app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://rayfix") as client:
-            for _ in range(600):
-                if (await client.get("/readyz")).status_code == httpx.codes.OK:
-                    break
-                await anyio.sleep(0.1)
-            answer = await client.post("/v1/positions", json=report)
+    with RunningApp(warehouse_table.path) as app:
+        answer = app.post("/v1/positions", report)
     assert answer.status_code == httpx.codes.OK
     position = [answer.json()["position"][axis] for axis in "xyz"]
     assert np.linalg.norm(np.subtract(position, drop.position)) < 1.0
-
-
-@pytest.fixture
-def anyio_backend() -> str:
-    """Run asynchronous tests on asyncio."""
-    return "asyncio"

@@ -10,9 +10,7 @@ from scipy.stats import multivariate_normal
 
 from rayfix.cli import main
 from rayfix.density import credible_levels, marginal_density
-from rayfix_service.http.examples import REPORT_EXAMPLES
-
-REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]
+from tests.support.reports import REPORT
 
 
 def test_a_marginal_is_the_mixture_of_the_marginals():

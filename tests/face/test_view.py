@@ -13,12 +13,10 @@ import trimesh
 
 from rayfix.cli import main
 from rayfix.view import ViewError, inline, read_reports
-from rayfix_service.http.examples import REPORT_EXAMPLES
 from rayfix_service.web.assets import load_assets
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
-
-REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]
+from tests.support.reports import REPORT
 
 
 def data_of(page: str) -> dict:

@@ -15,50 +15,19 @@ from websockets.typing import Subprotocol
 
 from rayfix.cli import main
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.http.app import create_app
 from rayfix_service.http.errors import ServiceError
-from rayfix_service.http.examples import REPORT_EXAMPLES
 from rayfix_service.http.keys import ApiKeys, add_key
 from rayfix_service.http.rates import RateLimit
-from rayfix_service.http.settings import ServiceSettings
+from tests.support.reports import REPORT
+from tests.support.running_app import RunningApp
+from tests.support.server_process import start_server
 
-REPORT: dict[str, Any] = REPORT_EXAMPLES["angle_and_time"]["value"]
 RANGES = {"measurements": [{"type": "pt", "station_id": "bs1", "range_m": 7.8, "stdev_m": 0.5}]}
 
 
-class Service:
-    """A ready application in a loop of its own."""
-
-    def __init__(self, table: Path, **settings: Any) -> None:
-        self.runner = asyncio.Runner()
-        app = create_app(table, ServiceSettings(**settings))
-        self._lifespan = app.router.lifespan_context(app)
-        self.http = httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test")
-        self.runner.run(self._start())
-
-    async def _start(self) -> None:
-        await self._lifespan.__aenter__()
-        async with asyncio.timeout(100):
-            while (await self.http.get("/readyz")).status_code != 200:
-                await asyncio.sleep(0.02)
-
-    def __enter__(self) -> "Service":
-        """Return itself, ready."""
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        """Stop it."""
-        self.runner.run(self.http.aclose())
-        self.runner.run(self._lifespan.__aexit__(None, None, None))
-        self.runner.close()
-
-    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Send a request."""
-        return self.runner.run(self.http.request(method, path, **options))
-
-    def post(self, document: Any = REPORT, path: str = "/v1/positions", **options: Any) -> httpx.Response:
-        """POST JSON."""
-        return self.request("POST", path, json=document, **options)
+def post(app: RunningApp, document: Any = REPORT, **options: Any) -> httpx.Response:
+    """POST the example report, or something else, as JSON."""
+    return app.post("/v1/positions", document, **options)
 
 
 # --- keys ------------------------------------------------------------------------------------------------
@@ -74,15 +43,15 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 
 @pytest.fixture(scope="module")
-def guarded(hall_table_path: Path, keys: tuple[Path, str]) -> Iterator[Service]:
-    with Service(hall_table_path, api_keys=keys[0]) as service:
+def guarded(hall_table_path: Path, keys: tuple[Path, str]) -> Iterator[RunningApp]:
+    with RunningApp(hall_table_path, api_keys=keys[0]) as service:
         yield service
 
 
 @pytest.mark.parametrize("scheme", ["Bearer {}", "bearer  {}", None])
-def test_a_key_opens(guarded: Service, keys: tuple[Path, str], scheme: str | None):
+def test_a_key_opens(guarded: RunningApp, keys: tuple[Path, str], scheme: str | None):
     headers = {"x-api-key": keys[1]} if scheme is None else {"authorization": scheme.format(keys[1])}
-    assert guarded.post(headers=headers).status_code == 200
+    assert post(guarded, headers=headers).status_code == 200
     assert guarded.request("GET", "/v1/tables", headers=headers).status_code == 200
     assert guarded.request("GET", "/metrics", headers=headers).status_code == 200
 
@@ -101,7 +70,7 @@ def test_a_key_opens(guarded: Service, keys: tuple[Path, str], scheme: str | Non
 @pytest.mark.parametrize(
     ("method", "path"), [("POST", "/v1/positions"), ("GET", "/v1/fixes"), ("GET", "/v1/nothing"), ("GET", "/metrics")]
 )
-def test_without_a_key_all_is_closed(guarded: Service, method: str, path: str, headers: Any):
+def test_without_a_key_all_is_closed(guarded: RunningApp, method: str, path: str, headers: Any):
     refusal = guarded.request(method, path, headers=headers)
     assert refusal.status_code == 401
     assert refusal.headers["www-authenticate"] == "Bearer"
@@ -110,19 +79,19 @@ def test_without_a_key_all_is_closed(guarded: Service, method: str, path: str, h
     assert refusal.headers["x-request-id"]
 
 
-def test_a_hash_is_no_key(guarded: Service, keys: tuple[Path, str]):
+def test_a_hash_is_no_key(guarded: RunningApp, keys: tuple[Path, str]):
     for line in keys[0].read_text().splitlines():
         for key in (line, *line.split(":")):
-            assert guarded.post(headers={"x-api-key": key}).status_code == 401
+            assert post(guarded, headers={"x-api-key": key}).status_code == 401
 
 
 @pytest.mark.parametrize("path", ["/livez", "/readyz", "/docs", "/openapi.json"])
-def test_health_and_documentation_are_open(guarded: Service, path: str):
+def test_health_and_documentation_are_open(guarded: RunningApp, path: str):
     assert guarded.request("GET", path).status_code == 200
 
 
-def test_a_key_in_a_query_is_none(guarded: Service, keys: tuple[Path, str]):
-    assert guarded.post(path=f"/v1/positions?api_key={keys[1]}&key={keys[1]}").status_code == 401
+def test_a_key_in_a_query_is_none(guarded: RunningApp, keys: tuple[Path, str]):
+    assert guarded.post(f"/v1/positions?api_key={keys[1]}&key={keys[1]}", REPORT).status_code == 401
 
 
 def test_keys_are_kept_as_hashes(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -148,11 +117,11 @@ def test_keys_are_kept_as_hashes(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_a_changed_key_file_is_read_again(hall_table_path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     path = tmp_path / "keys"
     old = add_key(path, "old")
-    with Service(hall_table_path, api_keys=path, watch_seconds=0.02) as service:
+    with RunningApp(hall_table_path, api_keys=path, watch_seconds=0.02) as service:
 
         def opens(key: str) -> bool:
-            service.runner.run(asyncio.sleep(0.1))
-            return service.post(headers={"x-api-key": key}).status_code == 200
+            service.run(asyncio.sleep(0.1))
+            return post(service, headers={"x-api-key": key}).status_code == 200
 
         path.write_text("nonsense", encoding="utf-8")
         assert opens(old)
@@ -163,7 +132,7 @@ def test_a_changed_key_file_is_read_again(hall_table_path: Path, tmp_path: Path,
         assert not opens(old)
 
 
-def test_streams_need_a_key_too(hall_table_path: Path, keys: tuple[Path, str], start_server: Any):
+def test_streams_need_a_key_too(hall_table_path: Path, keys: tuple[Path, str]):
     with start_server(hall_table_path, settings={"api_keys": str(keys[0])}) as server:
         url = f"ws://127.0.0.1:{server.port}/v1/stream"
         with pytest.raises(InvalidStatus) as refusal:
@@ -206,33 +175,33 @@ def test_a_bucket_empties_and_fills():
 def test_each_key_has_its_rate(hall_table_path: Path, tmp_path: Path):
     path = tmp_path / "keys"
     a, b = ({"x-api-key": add_key(path, name)} for name in "ab")
-    with Service(hall_table_path, api_keys=path, reports_per_second=0.01, burst_seconds=300.0) as service:
-        statuses = [service.post(headers=a).status_code for _ in range(4)]
+    with RunningApp(hall_table_path, api_keys=path, reports_per_second=0.01, burst_seconds=300.0) as service:
+        statuses = [post(service, headers=a).status_code for _ in range(4)]
         assert statuses == [200, 200, 200, 429]
-        refusal = service.post(headers=a)
+        refusal = post(service, headers=a)
         assert refusal.json()["type"] == "urn:rayfix:problem:too-many-requests"
         assert 90 <= int(refusal.headers["retry-after"]) <= 100
         assert service.request("GET", "/v1/table", headers=a).status_code == 200
         # A batch is its reports.
-        batch = service.post({"reports": [REPORT] * 3}, "/v1/positions/batch", headers=b)
+        batch = service.post("/v1/positions/batch", {"reports": [REPORT] * 3}, headers=b)
         assert batch.status_code == 200
-        assert service.post(headers=b).status_code == 429
+        assert post(service, headers=b).status_code == 429
 
 
 # --- origins ---------------------------------------------------------------------------------------------
 
 
-def test_other_origins_are_closed_unless_named(hall_table_path: Path, keys: tuple[Path, str], guarded: Service):
+def test_other_origins_are_closed_unless_named(hall_table_path: Path, keys: tuple[Path, str], guarded: RunningApp):
     origin = {"origin": "https://maps.example.com"}
     asking = origin | {"access-control-request-method": "POST", "access-control-request-headers": "authorization"}
     assert "access-control-allow-origin" not in guarded.request("GET", "/livez", headers=origin).headers
     assert guarded.request("OPTIONS", "/v1/positions", headers=asking).status_code == 401
-    with Service(hall_table_path, api_keys=keys[0], cors_origins=(origin["origin"],)) as service:
+    with RunningApp(hall_table_path, api_keys=keys[0], cors_origins=(origin["origin"],)) as service:
         allowed = service.request("OPTIONS", "/v1/positions", headers=asking)
         assert allowed.status_code == 200
         assert allowed.headers["access-control-allow-origin"] == origin["origin"]
         assert "authorization" in allowed.headers["access-control-allow-headers"].lower()
-        refusal = service.post(headers=origin)
+        refusal = post(service, headers=origin)
         assert (refusal.status_code, refusal.headers["access-control-allow-origin"]) == (401, origin["origin"])
         other = service.request("OPTIONS", "/v1/positions", headers=asking | {"origin": "https://evil.example"})
         assert "access-control-allow-origin" not in other.headers
@@ -251,7 +220,7 @@ def test_slow_fixes_are_bounded_and_fast_ones_go_on(hall_table_path: Path, monke
         return locate(self, report)
 
     settings = {"slow_fix_threads": 1, "slow_fixes_waiting": 1, "fix_seconds": 0.3}
-    with Service(hall_table_path, **settings) as service:
+    with RunningApp(hall_table_path, **settings) as service:
         monkeypatch.setattr(Locator, "locate", wait_and_locate)
 
         async def together() -> list[httpx.Response]:
@@ -262,7 +231,7 @@ def test_slow_fixes_are_bounded_and_fast_ones_go_on(hall_table_path: Path, monke
             batch = await service.http.post("/v1/positions/batch", json={"reports": [RANGES, REPORT]})
             return [fast, full, batch, *await asyncio.gather(*slow)]
 
-        fast, full, batch, *late = service.runner.run(together())
+        fast, full, batch, *late = service.run(together())
         assert fast.status_code == 200
         assert full.status_code == 503
         assert full.json()["type"] == "urn:rayfix:problem:overloaded"
@@ -274,18 +243,18 @@ def test_slow_fixes_are_bounded_and_fast_ones_go_on(hall_table_path: Path, monke
         gate.set()
         answers = []
         for _ in range(100):
-            answers.append(service.post(RANGES).status_code)
+            answers.append(post(service, RANGES).status_code)
             if answers[-1] == 200:
                 break
-            service.runner.run(asyncio.sleep(0.02))
+            service.run(asyncio.sleep(0.02))
         assert answers[-1] == 200
 
 
 def test_the_pool_changes_no_fix(hall_table_path: Path):
-    with Service(hall_table_path) as service:
+    with RunningApp(hall_table_path) as service:
         angle = REPORT["measurements"][0]
-        fixes = [service.post(RANGES).json() for _ in range(2)]
-        long = service.post({"measurements": [angle | {"azimuth_deg": 29.9 + 0.01 * n} for n in range(17)]}).json()
+        fixes = [post(service, RANGES).json() for _ in range(2)]
+        long = post(service, {"measurements": [angle | {"azimuth_deg": 29.9 + 0.01 * n} for n in range(17)]}).json()
     assert fixes[0]["position"] == fixes[1]["position"]
     distance = math.dist(fixes[0]["position"].values(), (0.1, 0.1, 2.4))
     assert distance < 7.8 + 3 * 0.5

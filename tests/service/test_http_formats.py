@@ -1,67 +1,32 @@
 """Other systems' formats over HTTP: inputs and outputs combine freely, and refusals name the field of the message."""
 
-import asyncio
 import copy
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
-from rayfix_service.http.app import create_app
 from rayfix_service.http.examples import (
     BATCH_EXAMPLES,
     NRPPA_EXAMPLES,
-    REPORT_EXAMPLES,
     SILABS_EXAMPLES,
     UBLOX_EXAMPLES,
 )
 from rayfix_service.http.outputs import AdaptedFixDocument, Local3dPointUncertaintyEllipsoid, OmloxLocation
+from tests.support.reports import REPORT
+from tests.support.running_app import RunningApp
 
-REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]
 NRPPA = NRPPA_EXAMPLES["ul_aoa_and_ul_rtoa"]["value"]
 SILABS = SILABS_EXAMPLES["three_locators"]["value"]
 LINES: str = UBLOX_EXAMPLES["three_anchors"]["value"]
 MODELS = {"3gpp": Local3dPointUncertaintyEllipsoid, "omlox": OmloxLocation}
 
 
-class Client:
-    """A ready application, for tests that are not coroutines."""
-
-    def __init__(self, table_path: Path) -> None:
-        self._runner = asyncio.Runner()
-        app = create_app(table_path)
-        self._lifespan = app.router.lifespan_context(app)
-        self._http = httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test")
-        self._runner.run(self._start())
-
-    async def _start(self) -> None:
-        await self._lifespan.__aenter__()
-        async with asyncio.timeout(100):
-            while (await self._http.get("/readyz")).status_code != 200:
-                await asyncio.sleep(0.02)
-
-    def post(self, path: str, body: Any) -> httpx.Response:
-        """POST JSON, or a text as plain text."""
-        if isinstance(body, str):
-            options: dict[str, Any] = {"content": body, "headers": {"content-type": "text/plain; charset=utf-8"}}
-        else:
-            options = {"json": body}
-        return self._runner.run(self._http.post(path, **options))
-
-    def close(self) -> None:
-        """Stop the application."""
-        self._runner.run(self._http.aclose())
-        self._runner.run(self._lifespan.__aexit__(None, None, None))
-        self._runner.close()
-
-
-@pytest.fixture(scope="module")
-def client(hall_table_path: Path) -> Iterator[Client]:
-    client = Client(hall_table_path)
-    yield client
-    client.close()
+def post(app: RunningApp, path: str, body: Any) -> httpx.Response:
+    """POST JSON, or a text as plain text."""
+    if isinstance(body, str):
+        return app.post_bytes(path, body, {"content-type": "text/plain; charset=utf-8"})
+    return app.post(path, body)
 
 
 @pytest.mark.parametrize("output", ["3gpp", "omlox"])
@@ -75,10 +40,10 @@ def client(hall_table_path: Path) -> Iterator[Client]:
         ("/v1/positions/ublox", LINES),
     ],
 )
-def test_every_input_goes_with_every_output(client: Client, path: str, body: Any, output: str):
-    response = client.post(f"{path}?output={output}", body)
+def test_every_input_goes_with_every_output(hall_app: RunningApp, path: str, body: Any, output: str):
+    response = post(hall_app, f"{path}?output={output}", body)
     assert response.status_code == 200
-    native = client.post(f"{path}?output=native", body).json()
+    native = post(hall_app, f"{path}?output=native", body).json()
     answers = response.json().get("results", [response.json()])
     fixes = native.get("results", [native])
     assert len(answers) == len(fixes)
@@ -88,11 +53,11 @@ def test_every_input_goes_with_every_output(client: Client, path: str, body: Any
         assert position == fix["position"]
 
 
-def test_a_native_answer_tells_what_became_of_the_messages_measurements(client: Client):
+def test_a_native_answer_tells_what_became_of_the_messages_measurements(hall_app: RunningApp):
     message = copy.deepcopy(NRPPA)
     results = message["TRP-MeasurementResponseList"][0]["measurementResult"]
     results.insert(0, {"measuredResultsValue": {"ZoA": {"zenithAoA": 900}}})
-    fix = AdaptedFixDocument.model_validate(client.post("/v1/positions/nrppa", message).json())
+    fix = AdaptedFixDocument.model_validate(post(hall_app, "/v1/positions/nrppa", message).json())
     assert fix.target_id == "ue-7"
     assert [outcome.source for outcome in fix.measurements] == [
         f"['TRP-MeasurementResponseList'][{n}].measurementResult[{k}].measuredResultsValue['{name}']"
@@ -108,24 +73,24 @@ def test_a_native_answer_tells_what_became_of_the_messages_measurements(client: 
     assert "without an azimuth" in skipped.reason
 
 
-def test_one_bad_transmission_leaves_the_others_alone(client: Client):
+def test_one_bad_transmission_leaves_the_others_alone(hall_app: RunningApp):
     lines = LINES + LINES.replace("40871", "40872").replace('"bs2"', '"bs9"')
-    good, bad = client.post("/v1/positions/ublox", lines).json()["results"]
+    good, bad = post(hall_app, "/v1/positions/ublox", lines).json()["results"]
     assert good["position"] is not None
     assert bad["status"] == 422
     assert bad["errors"][0]["path"] == "lines[4]"
     assert "station 'bs9' is not in the table" in bad["detail"]
-    good, better = client.post("/v1/positions/ublox?station=bs9=bs2", lines).json()["results"]
+    good, better = post(hall_app, "/v1/positions/ublox?station=bs9=bs2", lines).json()["results"]
     assert better["position"] == good["position"]
 
 
-def test_a_known_height_moves_the_fix_there(client: Client):
-    (plain,) = client.post("/v1/positions/ublox", LINES).json()["results"]
-    (fixed,) = client.post("/v1/positions/ublox?height_m=1.5&height_stdev_m=0.01", LINES).json()["results"]
+def test_a_known_height_moves_the_fix_there(hall_app: RunningApp):
+    (plain,) = post(hall_app, "/v1/positions/ublox", LINES).json()["results"]
+    (fixed,) = post(hall_app, "/v1/positions/ublox?height_m=1.5&height_stdev_m=0.01", LINES).json()["results"]
     assert fixed["position"]["z"] == pytest.approx(1.5, abs=0.03)
     assert fixed["vertical_accuracy_m"] < 0.02 < plain["vertical_accuracy_m"]
     message = {**SILABS, "height": {"z_m": 1.5, "stdev_m": 0.01}}
-    assert client.post("/v1/positions/silabs", message).json()["position"]["z"] == pytest.approx(1.5, abs=0.03)
+    assert post(hall_app, "/v1/positions/silabs", message).json()["position"]["z"] == pytest.approx(1.5, abs=0.03)
 
 
 @pytest.mark.parametrize(
@@ -141,8 +106,8 @@ def test_a_known_height_moves_the_fix_there(client: Client):
         ("/v1/positions/silabs", {**SILABS, "angles": []}, 422, "angles", "an array of 1 to 256 angles"),
     ],
 )
-def test_refusals_are_problems(client: Client, path: str, body: Any, status: int, field: str | None, words: str):
-    response = client.post(path, body)
+def test_refusals_are_problems(hall_app: RunningApp, path: str, body: Any, status: int, field: str | None, words: str):
+    response = post(hall_app, path, body)
     assert response.status_code == status
     assert response.headers["content-type"] == "application/problem+json"
     problem = response.json()
@@ -151,10 +116,10 @@ def test_refusals_are_problems(client: Client, path: str, body: Any, status: int
         assert problem["errors"][0]["path"] == field
 
 
-def test_without_position_there_is_a_problem_instead(client: Client):
+def test_without_position_there_is_a_problem_instead(hall_app: RunningApp):
     # A single time of arrival says nothing.
     report = {"measurements": [{"type": "toa", "station_id": "bs1", "range_m": 131.0, "stdev_m": 0.5}]}
-    assert client.post("/v1/positions", report).json()["position"] is None
-    response = client.post("/v1/positions?output=omlox", report)
+    assert post(hall_app, "/v1/positions", report).json()["position"] is None
+    response = post(hall_app, "/v1/positions?output=omlox", report)
     assert response.status_code == 422
     assert "ask for the native one" in response.json()["detail"]

@@ -5,7 +5,6 @@ import json
 import random
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from rayfix_service.http.examples import (
     UBLOX_EXAMPLES,
 )
 from rayfix_service.http.openapi import openapi_text
+from tests.support.server_process import start_server
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "openapi.json"
 
@@ -78,7 +78,7 @@ def test_the_committed_document_is_that_of_the_code():
 
 
 @pytest.mark.slow
-def test_schemathesis_finds_nothing(hall_table_path: Path, start_server: Callable[..., Any]):
+def test_schemathesis_finds_nothing(hall_table_path: Path):
     with start_server(hall_table_path) as server:
         command = [
             Path(sys.executable).with_name("schemathesis"),

@@ -1,6 +1,5 @@
 """What whoever runs the service sees: figures, request identifiers, logs."""
 
-import asyncio
 import io
 import json
 import logging
@@ -10,70 +9,42 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import Fix, Outcome
-from rayfix_service.http.app import create_app
-from rayfix_service.http.examples import BATCH_EXAMPLES, REPORT_EXAMPLES, UBLOX_EXAMPLES
+from rayfix_service.http.examples import BATCH_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.http.logs import JsonFormatter, log_config
 from rayfix_service.http.metrics import Metrics
 from rayfix_service.http.request_context import ACCESS_LOGGER, REQUEST_ID
 from rayfix_tables.table import Table
-
-REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]
-
-
-class Service:
-    """A ready application in a loop of its own."""
-
-    def __init__(self, table_path: Path) -> None:
-        self._runner = asyncio.Runner()
-        app = create_app(table_path)
-        self._lifespan = app.router.lifespan_context(app)
-        self._http = httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test")
-        self._runner.run(self._start())
-
-    async def _start(self) -> None:
-        await self._lifespan.__aenter__()
-        async with asyncio.timeout(100):
-            while (await self._http.get("/readyz")).status_code != 200:
-                await asyncio.sleep(0.02)
-
-    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Send a request."""
-        return self._runner.run(self._http.request(method, path, **options))
-
-    def figures(self) -> dict[tuple[str, ...], float]:
-        """Values by name and labels, in the order of their names."""
-        text = self.request("GET", "/metrics").text
-        return {
-            (sample.name, *(sample.labels[key] for key in sorted(sample.labels))): sample.value
-            for family in text_string_to_metric_families(text)
-            for sample in family.samples
-        }
-
-    def close(self) -> None:
-        """Stop it."""
-        self._runner.run(self._http.aclose())
-        self._runner.run(self._lifespan.__aexit__(None, None, None))
-        self._runner.close()
+from tests.support.reports import REPORT
+from tests.support.running_app import RunningApp
 
 
 @pytest.fixture(scope="module")
-def service(hall_table_path: Path) -> Iterator[Service]:
-    service = Service(hall_table_path)
-    yield service
-    service.close()
+def service(hall_table_path: Path) -> Iterator[RunningApp]:
+    """Return an application whose figures nobody else makes grow."""
+    with RunningApp(hall_table_path) as service:
+        yield service
 
 
-def grown(service: Service, act: Callable[[], Any]) -> dict[tuple[str, ...], float]:
+def figures_of(service: RunningApp) -> dict[tuple[str, ...], float]:
+    """Values by name and labels, in the order of their names."""
+    text = service.get("/metrics").text
+    return {
+        (sample.name, *(sample.labels[key] for key in sorted(sample.labels))): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def grown(service: RunningApp, act: Callable[[], Any]) -> dict[tuple[str, ...], float]:
     """Run something; by how much figures that it changed have grown, the times aside."""
-    before = service.figures()
+    before = figures_of(service)
     act()
-    after = service.figures()
+    after = figures_of(service)
     return {
         key: value - before.get(key, 0.0)
         for key, value in after.items()
@@ -86,9 +57,9 @@ def own(figures: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float]:
     return {key: value for key, value in figures.items() if "/metrics" not in key}
 
 
-def test_a_report_is_counted(service: Service):
+def test_a_report_is_counted(service: RunningApp):
     def act() -> None:
-        assert service.request("POST", "/v1/positions", json=REPORT).json()["status"] == "ok"
+        assert service.post("/v1/positions", REPORT).json()["status"] == "ok"
 
     assert own(grown(service, act)) == {
         ("rayfix_http_requests_total", "POST", "/v1/positions", "200"): 1,
@@ -99,9 +70,9 @@ def test_a_report_is_counted(service: Service):
     }
 
 
-def test_each_fix_of_a_batch_is_counted(service: Service):
+def test_each_fix_of_a_batch_is_counted(service: RunningApp):
     batch = {"reports": [*BATCH_EXAMPLES["two_reports"]["value"]["reports"], {"measurements": []}]}
-    figures = own(grown(service, lambda: service.request("POST", "/v1/positions/batch", json=batch)))
+    figures = own(grown(service, lambda: service.post("/v1/positions/batch", batch)))
     assert figures["rayfix_http_requests_total", "POST", "/v1/positions/batch", "200"] == 1
     assert figures["rayfix_fusion_seconds_count",] == 2
     assert sum(value for key, value in figures.items() if key[0] == "rayfix_fixes_total") == 2
@@ -121,7 +92,7 @@ def test_each_fix_of_a_batch_is_counted(service: Service):
     ],
 )
 def test_refusals_are_counted_by_route_and_not_by_path(
-    service: Service, method: str, path: str, body: Any, route: str, status: str
+    service: RunningApp, method: str, path: str, body: Any, route: str, status: str
 ):
     figures = own(grown(service, lambda: service.request(method, path, json=body)))
     assert figures == {
@@ -130,7 +101,7 @@ def test_refusals_are_counted_by_route_and_not_by_path(
     }
 
 
-def test_methods_without_end_are_one(service: Service):
+def test_methods_without_end_are_one(service: RunningApp):
     figures = own(grown(service, lambda: service.request("BREW", "/livez")))
     assert {key[1] for key in figures} == {"other"}
 
@@ -157,8 +128,8 @@ def test_outcomes_of_measurements_are_told_apart():
         assert f"\n{line}\n" in text
 
 
-def test_the_table_and_readiness_are_told(service: Service, hall_table_path: Path):
-    figures = service.figures()
+def test_the_table_and_readiness_are_told(service: RunningApp, hall_table_path: Path):
+    figures = figures_of(service)
     table = Table.open(hall_table_path)
     labels = ("1", "hall", table.software_version, "hall", table.table_id)
     assert table.format_version == 1
@@ -167,10 +138,10 @@ def test_the_table_and_readiness_are_told(service: Service, hall_table_path: Pat
     assert figures["process_resident_memory_bytes",] > 1e6
 
 
-def test_the_page_lists_every_figure(service: Service):
+def test_the_page_lists_every_figure(service: RunningApp):
     page = (Path(__file__).resolve().parents[2] / "docs" / "operations.md").read_text(encoding="utf-8")
     listed = set(re.findall(r"^\| `(rayfix_\w+)`", page, flags=re.MULTILINE))
-    text = service.request("GET", "/metrics").text
+    text = service.get("/metrics").text
     assert listed == {
         f"{family.name}_total" if family.type == "counter" else family.name
         for family in text_string_to_metric_families(text)
@@ -178,30 +149,30 @@ def test_the_page_lists_every_figure(service: Service):
     }
 
 
-def test_openmetrics_is_given_to_who_asks(service: Service):
-    response = service.request("GET", "/metrics", headers={"accept": "application/openmetrics-text; version=1.0.0"})
+def test_openmetrics_is_given_to_who_asks(service: RunningApp):
+    response = service.get("/metrics", headers={"accept": "application/openmetrics-text; version=1.0.0"})
     assert response.headers["content-type"].startswith("application/openmetrics-text")
     assert response.text.endswith("# EOF\n")
-    assert service.request("GET", "/metrics").headers["content-type"].startswith("text/plain")
+    assert service.get("/metrics").headers["content-type"].startswith("text/plain")
 
 
 @pytest.mark.parametrize("path", ["/livez", "/no/such/path", "/v1/positions"])
-def test_a_request_id_is_echoed_or_made(service: Service, path: str):
-    given = service.request("GET", path, headers={"x-request-id": "Root=1-67891233-abcdef012345678912345678"})
+def test_a_request_id_is_echoed_or_made(service: RunningApp, path: str):
+    given = service.get(path, headers={"x-request-id": "Root=1-67891233-abcdef012345678912345678"})
     assert given.headers["x-request-id"] == "Root=1-67891233-abcdef012345678912345678"
-    made = {service.request("GET", path).headers["x-request-id"] for _ in range(3)}
+    made = {service.get(path).headers["x-request-id"] for _ in range(3)}
     assert len(made) == 3
     assert all(re.fullmatch("[0-9a-f]{32}", identifier) for identifier in made)
 
 
 @pytest.mark.parametrize("unfit", ["", "two words", "x" * 129, '"quoted"', "caf\u00e9".encode("latin-1")])
-def test_an_id_that_is_unfit_for_a_log_is_replaced(service: Service, unfit: Any):
-    response = service.request("GET", "/livez", headers={"x-request-id": unfit})
+def test_an_id_that_is_unfit_for_a_log_is_replaced(service: RunningApp, unfit: Any):
+    response = service.get("/livez", headers={"x-request-id": unfit})
     assert re.fullmatch("[0-9a-f]{32}", response.headers["x-request-id"])
 
 
 def test_a_defect_is_logged_with_its_request(
-    service: Service, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    service: RunningApp, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     def fail(self: Locator, report: Any) -> Any:
         raise RuntimeError("a defect")
@@ -213,7 +184,7 @@ def test_a_defect_is_logged_with_its_request(
     logger = logging.getLogger("rayfix_service")
     logger.addHandler(handler)
     try:
-        response = service.request("POST", "/v1/positions", json=REPORT, headers={"x-request-id": "r-9"})
+        response = service.post("/v1/positions", REPORT, headers={"x-request-id": "r-9"})
     finally:
         logger.removeHandler(handler)
     assert response.status_code == 500
@@ -223,18 +194,18 @@ def test_a_defect_is_logged_with_its_request(
     assert entry["message"] == "request POST /v1/positions failed"
     assert "RuntimeError: a defect" in entry["exception"]
     assert REQUEST_ID.get() is None
-    figures = service.figures()
+    figures = figures_of(service)
     assert figures["rayfix_http_requests_total", "POST", "/v1/positions", "500"] == 1
 
 
-def test_a_line_per_request_is_written_on_demand(service: Service, caplog: pytest.LogCaptureFixture):
+def test_a_line_per_request_is_written_on_demand(service: RunningApp, caplog: pytest.LogCaptureFixture):
     with caplog.at_level(logging.INFO, logger=ACCESS_LOGGER):
-        service.request("GET", "/livez", headers={"x-request-id": "r-2"})
+        service.get("/livez", headers={"x-request-id": "r-2"})
     (record,) = caplog.records
     assert re.fullmatch(r"GET /livez 200 in \d+\.\d ms, request r-2", record.getMessage())
     caplog.clear()
     with caplog.at_level(logging.WARNING, logger=ACCESS_LOGGER):
-        service.request("GET", "/livez")
+        service.get("/livez")
     assert caplog.records == []
 
 

@@ -6,7 +6,6 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -17,7 +16,6 @@ from rayfix_service.http.examples import (
     BATCH_EXAMPLES,
     FIX_EVENT_EXAMPLE,
     NRPPA_EXAMPLES,
-    REPORT_EXAMPLES,
     SILABS_EXAMPLES,
     UBLOX_EXAMPLES,
 )
@@ -25,12 +23,12 @@ from rayfix_service.http.feed import QUEUE_LENGTH, FixFeed
 from rayfix_service.http.feed_relay import FeedRelay
 from rayfix_service.http.routes_stream import FixEventDocument
 from rayfix_service.wire import FixDocument, parse_report
-
-REPORT: dict[str, Any] = REPORT_EXAMPLES["angle_and_time"]["value"]
+from tests.support.reports import REPORT
+from tests.support.server_process import ServerProcess, start_server
 
 
 @pytest.fixture(scope="module")
-def server(hall_table_path: Path, start_server: Callable[..., Any]) -> Iterator[Any]:
+def server(hall_table_path: Path) -> Iterator[ServerProcess]:
     with start_server(hall_table_path) as server:
         yield server
 
@@ -38,7 +36,7 @@ def server(hall_table_path: Path, start_server: Callable[..., Any]) -> Iterator[
 class Listener:
     """A listener of the feed, that hears of everything from when it is made."""
 
-    def __init__(self, server: Any, query: str = "") -> None:
+    def __init__(self, server: ServerProcess, query: str = "") -> None:
         self._http = server.client()
         self._context = self._http.stream("GET", f"/v1/fixes{query}")
         self.response: httpx.Response = self._context.__enter__()
@@ -64,7 +62,7 @@ class Listener:
 
 
 @pytest.fixture
-def listen(server: Any) -> Iterator[Callable[[str], Listener]]:
+def listen(server: ServerProcess) -> Iterator[Callable[[str], Listener]]:
     listeners: list[Listener] = []
 
     def listen(query: str = "") -> Listener:
@@ -77,7 +75,7 @@ def listen(server: Any) -> Iterator[Callable[[str], Listener]]:
 
 
 @pytest.fixture
-def socket(server: Any) -> Iterator[ClientConnection]:
+def socket(server: ServerProcess) -> Iterator[ClientConnection]:
     with connect(f"ws://127.0.0.1:{server.port}/v1/stream") as connection:
         yield connection
 
@@ -85,7 +83,7 @@ def socket(server: Any) -> Iterator[ClientConnection]:
 # --- the feed --------------------------------------------------------------------------------------------
 
 
-def test_the_feed_tells_of_each_fix_and_its_report(server: Any, listen: Callable[..., Listener]):
+def test_the_feed_tells_of_each_fix_and_its_report(server: ServerProcess, listen: Callable[..., Listener]):
     listener = listen()
     assert listener.response.headers["content-type"] == "text/event-stream; charset=utf-8"
     assert listener.response.headers["cache-control"] == "no-store"
@@ -100,7 +98,7 @@ def test_the_feed_tells_of_each_fix_and_its_report(server: Any, listen: Callable
     assert json.loads(second["data"]) == {"table": "hall", "report": REPORT | {"target_id": "two\nlines"}, "fix": again}
 
 
-def test_every_route_tells_the_feed(server: Any, socket: ClientConnection, listen: Callable[..., Listener]):
+def test_every_route_tells_the_feed(server: ServerProcess, socket: ClientConnection, listen: Callable[..., Listener]):
     listener = listen()
     batch = BATCH_EXAMPLES["two_reports"]["value"]
     nrppa = NRPPA_EXAMPLES["multi_rtt"]["value"]
@@ -132,7 +130,7 @@ def test_every_route_tells_the_feed(server: Any, socket: ClientConnection, liste
             assert event["fix"]["target_id"] == event["report"].get("target_id")
 
 
-def test_one_target_may_be_followed(server: Any, listen: Callable[..., Listener]):
+def test_one_target_may_be_followed(server: ServerProcess, listen: Callable[..., Listener]):
     listener = listen("?target_id=b")
     with server.client() as http:
         for target in ("a", "b", None, "c", "b"):
@@ -191,7 +189,7 @@ def test_waiting_ends_with_an_event_with_the_end_and_with_the_time():
     asyncio.run(wait())
 
 
-def test_open_streams_do_not_hold_up_the_end(hall_table_path: Path, start_server: Callable[..., Any]):
+def test_open_streams_do_not_hold_up_the_end(hall_table_path: Path):
     with start_server(hall_table_path) as server:
         listener = Listener(server)
         with connect(f"ws://127.0.0.1:{server.port}/v1/stream") as socket:
@@ -245,7 +243,7 @@ def test_workers_tell_each_other(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_a_listener_hears_of_all_workers(hall_table_path: Path, start_server: Callable[..., Any]):
+def test_a_listener_hears_of_all_workers(hall_table_path: Path):
     with start_server(hall_table_path, workers=2) as server:
         listener = Listener(server)
         for number in range(20):  # each on a connection of its own, which either worker takes
@@ -279,13 +277,13 @@ def test_each_message_is_answered_in_its_order(socket: ClientConnection):
     assert empty["errors"][0]["path"] == "measurements"
 
 
-def test_the_stream_has_other_outputs(server: Any):
+def test_the_stream_has_other_outputs(server: ServerProcess):
     with connect(f"ws://127.0.0.1:{server.port}/v1/stream?output=omlox") as socket:
         socket.send(json.dumps(REPORT))
         assert json.loads(socket.recv())["crs"] == "local"
 
 
-def test_a_message_that_is_too_long_is_refused(server: Any, socket: ClientConnection):
+def test_a_message_that_is_too_long_is_refused(server: ServerProcess, socket: ClientConnection):
     socket.send(" " * (1 << 20) + json.dumps(REPORT))
     refusal = json.loads(socket.recv())
     assert refusal["status"] == 413
@@ -299,14 +297,14 @@ def test_a_message_that_is_too_long_is_refused(server: Any, socket: ClientConnec
     assert closed.value.rcvd is None or closed.value.rcvd.code == 1009
 
 
-def test_what_is_no_stream_is_refused_before_it_opens(server: Any):
+def test_what_is_no_stream_is_refused_before_it_opens(server: ServerProcess):
     with pytest.raises(InvalidStatus) as refusal:
         connect(f"ws://127.0.0.1:{server.port}/v1/stream?output=morse")
     assert refusal.value.response.status_code == 422
     assert "output" in json.loads(refusal.value.response.body)["detail"]
 
 
-def test_a_client_that_sends_without_reading_waits_and_others_do_not(server: Any):
+def test_a_client_that_sends_without_reading_waits_and_others_do_not(server: ServerProcess):
     with connect(f"ws://127.0.0.1:{server.port}/v1/stream", compression=None) as socket:
         for _ in range(200):
             socket.send(json.dumps(REPORT))

@@ -9,17 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import httpx
 import pytest
 
-from rayfix_service.http.app import create_app
-from rayfix_service.http.examples import REPORT_EXAMPLES
 from rayfix_service.http.server import serve
-from rayfix_service.http.settings import ServiceSettings
 from rayfix_tables.errors import TableError
 from rayfix_tables.schema import content_attributes, content_id, dataset_paths
+from tests.support.damage import flip_a_bit
+from tests.support.reports import REPORT
+from tests.support.running_app import RunningApp
 
-REPORT: dict[str, Any] = REPORT_EXAMPLES["angle_and_time"]["value"]
 POLL = 0.05  # s
 
 
@@ -36,58 +34,19 @@ def put_table(source: Path, path: Path, site_name: str) -> str:
 
 def put_damaged(source: Path, path: Path) -> None:
     """Rename a copy of a table with one wrong bit into place."""
-    content = bytearray(source.read_bytes())
-    with h5py.File(source, "r") as file:
-        content[file["scene/vertices_m"].id.get_offset()] ^= 1
-    path.with_suffix(".new").write_bytes(content)
-    os.replace(path.with_suffix(".new"), path)
+    beside = Path(shutil.copy(source, path.with_suffix(".new")))
+    flip_a_bit(beside, "scene/vertices_m")
+    os.replace(beside, path)
 
 
-class Service:
-    """A ready application of a folder of tables, in a loop of its own."""
+def watching(tables: Path, **settings: Any) -> RunningApp:
+    """Return an application that often looks at its tables' files."""
+    return RunningApp(tables, watch_seconds=POLL, **settings)
 
-    def __init__(self, tables: Path, **settings: Any) -> None:
-        self.runner = asyncio.Runner()
-        app = create_app(tables, ServiceSettings(watch_seconds=POLL, **settings))
-        self._lifespan = app.router.lifespan_context(app)
-        self.http = httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test")
-        self.runner.run(self._lifespan.__aenter__())
 
-    def __enter__(self) -> "Service":
-        """Wait until it is ready."""
-        self.wait(lambda: self.get("/readyz").status_code == 200)
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        """Stop it."""
-        self.runner.run(self.http.aclose())
-        self.runner.run(self._lifespan.__aexit__(None, None, None))
-        self.runner.close()
-
-    def get(self, path: str) -> httpx.Response:
-        """GET."""
-        return self.runner.run(self.http.get(path))
-
-    def post(self, path: str, document: Any = None) -> httpx.Response:
-        """POST JSON."""
-        return self.runner.run(self.http.post(path, json=document))
-
-    def names(self) -> dict[str, str]:
-        """Names of sites by those of their tables."""
-        return {table["name"]: table["site"]["name"] for table in self.get("/v1/tables").json()["tables"]}
-
-    def wait(self, condition: Any, seconds: float = 60.0) -> None:
-        """Wait until something holds."""
-
-        async def wait() -> None:
-            async with asyncio.timeout(seconds):
-                await asyncio.sleep(POLL / 5)
-
-        for _ in range(int(seconds / POLL * 5)):
-            if condition():
-                return
-            self.runner.run(wait())
-        raise AssertionError("not in time")
+def names(service: RunningApp) -> dict[str, str]:
+    """Names of sites by those of their tables."""
+    return {table["name"]: table["site"]["name"] for table in service.get("/v1/tables").json()["tables"]}
 
 
 @pytest.fixture
@@ -99,13 +58,13 @@ def folder(hall_table_path: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def service(folder: Path) -> Iterator[Service]:
-    with Service(folder) as service:
+def service(folder: Path) -> Iterator[RunningApp]:
+    with watching(folder) as service:
         yield service
 
 
-def test_tables_of_a_folder_are_told_apart_by_name(service: Service):
-    assert service.names() == {"ground": "ground floor", "upper": "upper floor"}
+def test_tables_of_a_folder_are_told_apart_by_name(service: RunningApp):
+    assert names(service) == {"ground": "ground floor", "upper": "upper floor"}
     ready = service.get("/readyz").json()
     assert [table["name"] for table in ready["tables"]] == ["ground", "upper"]
     for name, table_id in ((table["name"], table["table_id"]) for table in ready["tables"]):
@@ -116,7 +75,7 @@ def test_tables_of_a_folder_are_told_apart_by_name(service: Service):
     assert result["table_id"] == ready["tables"][1]["table_id"]
 
 
-def test_a_table_must_be_named_where_there_are_several(service: Service):
+def test_a_table_must_be_named_where_there_are_several(service: RunningApp):
     for path in ("/v1/table", "/v1/stations"):
         refusal = service.get(path)
         assert refusal.status_code == 422
@@ -128,7 +87,7 @@ def test_a_table_must_be_named_where_there_are_several(service: Service):
         assert "'attic'; give one of ground, upper" in service.get(path).json()["detail"]
 
 
-def test_the_table_named_default_needs_no_name(service: Service, folder: Path, hall_table_path: Path):
+def test_the_table_named_default_needs_no_name(service: RunningApp, folder: Path, hall_table_path: Path):
     default = put_table(hall_table_path, folder / "default.h5", "default floor")
     assert service.post("/v1/tables/reload").json() == {
         "tables": [
@@ -140,13 +99,13 @@ def test_the_table_named_default_needs_no_name(service: Service, folder: Path, h
     assert service.post("/v1/positions", REPORT).json()["table_id"] == default
 
 
-def test_a_new_file_is_swapped_in_by_itself(service: Service, folder: Path, hall_table_path: Path):
+def test_a_new_file_is_swapped_in_by_itself(service: RunningApp, folder: Path, hall_table_path: Path):
     for name in ("first", "second"):
         put_table(hall_table_path, folder / "ground.h5", name)
-        service.wait(lambda name=name: service.names()["ground"] == name)
-        assert service.names()["upper"] == "upper floor"
+        service.wait_for(lambda name=name: names(service)["ground"] == name)
+        assert names(service)["upper"] == "upper floor"
     put_table(hall_table_path, folder / "attic.h5", "attic")
-    service.wait(lambda: "attic" in service.names())
+    service.wait_for(lambda: "attic" in names(service))
     figures = service.get("/metrics").text
     assert 'rayfix_table_loads_total{outcome="loaded"} 5.0' in figures
     (now,) = (line for line in figures.splitlines() if 'site="second"' in line)
@@ -156,7 +115,7 @@ def test_a_new_file_is_swapped_in_by_itself(service: Service, folder: Path, hall
 
 
 def test_a_bad_file_is_refused_and_the_old_table_answers(
-    service: Service, folder: Path, hall_table_path: Path, caplog: pytest.LogCaptureFixture
+    service: RunningApp, folder: Path, hall_table_path: Path, caplog: pytest.LogCaptureFixture
 ):
     put_damaged(hall_table_path, folder / "ground.h5")
     refusal = service.post("/v1/tables/reload")
@@ -167,29 +126,29 @@ def test_a_bad_file_is_refused_and_the_old_table_answers(
     assert document["detail"].startswith("ground.h5 is damaged: the checksum of scene/vertices_m does not match")
     assert str(folder) not in refusal.text
     assert str(folder / "ground.h5") in caplog.text
-    assert service.names() == {"ground": "ground floor", "upper": "upper floor"}
+    assert names(service) == {"ground": "ground floor", "upper": "upper floor"}
     assert service.get("/readyz").status_code == 200
     assert service.post("/v1/positions?table=ground", REPORT).status_code == 200
     assert 'rayfix_table_loads_total{outcome="refused"} 1.0' in service.get("/metrics").text
     put_table(hall_table_path, folder / "ground.h5", "mended")
-    service.wait(lambda: service.names()["ground"] == "mended")
+    service.wait_for(lambda: names(service)["ground"] == "mended")
 
 
-def test_a_bad_file_is_refused_once(service: Service, folder: Path):
+def test_a_bad_file_is_refused_once(service: RunningApp, folder: Path):
     (folder / "new.h5").write_bytes(b"no table")
     figure = 'rayfix_table_loads_total{outcome="refused"} 1.0'
-    service.wait(lambda: figure in service.get("/metrics").text)
-    service.runner.run(asyncio.sleep(5 * POLL))
+    service.wait_for(lambda: figure in service.get("/metrics").text)
+    service.run(asyncio.sleep(5 * POLL))
     assert figure in service.get("/metrics").text
-    assert "new" not in service.names()
+    assert "new" not in names(service)
 
 
-def test_a_file_that_is_gone_matters_at_the_next_reload(service: Service, folder: Path):
+def test_a_file_that_is_gone_matters_at_the_next_reload(service: RunningApp, folder: Path):
     (folder / "upper.h5").unlink()
-    service.runner.run(asyncio.sleep(5 * POLL))
-    assert "upper" in service.names()
+    service.run(asyncio.sleep(5 * POLL))
+    assert "upper" in names(service)
     assert {"name": "upper", "change": "removed"} in service.post("/v1/tables/reload").json()["tables"]
-    assert service.names() == {"ground": "ground floor"}
+    assert names(service) == {"ground": "ground floor"}
     # An empty folder is more likely one that is not mounted.
     (folder / "ground.h5").unlink()
     refusal = service.post("/v1/tables/reload")
@@ -202,24 +161,24 @@ def test_a_file_that_is_gone_matters_at_the_next_reload(service: Service, folder
 def test_other_workers_follow_a_reload(folder: Path, tmp_path: Path):
     runtime = tmp_path / "runtime"
     runtime.mkdir()
-    with Service(folder, runtime_folder=runtime) as one, Service(folder, runtime_folder=runtime) as other:
+    with watching(folder, runtime_folder=runtime) as one, watching(folder, runtime_folder=runtime) as other:
         (folder / "upper.h5").unlink()
         one.post("/v1/tables/reload")
-        other.wait(lambda: other.names() == {"ground": "ground floor"})
+        other.wait_for(lambda: names(other) == {"ground": "ground floor"})
 
 
 def test_a_worker_that_replaces_another_waits_until_it_can_locate(hall_table_path: Path, tmp_path: Path):
-    with Service(hall_table_path, runtime_folder=tmp_path):
-        replacement = Service(hall_table_path, runtime_folder=tmp_path)
+    with (
+        watching(hall_table_path, runtime_folder=tmp_path),
+        watching(hall_table_path, ready=False, runtime_folder=tmp_path) as replacement,
+    ):
         assert replacement.get("/readyz").status_code == 200
-        with replacement:
-            pass
 
 
 def test_no_request_fails_while_tables_are_swapped(hall_table_path: Path, tmp_path: Path):
     path = tmp_path / "hall.h5"
     put_table(hall_table_path, path, "0")
-    with Service(path) as service:
+    with watching(path) as service:
 
         async def ask(done: asyncio.Event) -> list[tuple[int, str]]:
             answers = []
@@ -240,7 +199,7 @@ def test_no_request_fails_while_tables_are_swapped(hall_table_path: Path, tmp_pa
             done.set()
             return await asyncio.gather(*asking), identifiers
 
-        answers, identifiers = service.runner.run(swap())
+        answers, identifiers = service.run(swap())
     for each in answers:
         assert {status for status, _ in each} == {200}
         assert identifiers <= {table_id for _, table_id in each}

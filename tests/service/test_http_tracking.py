@@ -16,12 +16,13 @@ from starlette.requests import HTTPConnection
 from rayfix.client.models import fix_answer
 from rayfix_service.adapters.omlox_hub import HubSettings
 from rayfix_service.http.app import create_app
-from rayfix_service.http.examples import REPORT_EXAMPLES, SILABS_EXAMPLES
+from rayfix_service.http.examples import SILABS_EXAMPLES
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.wanted import get_wanted
 from rayfix_service.wire import FixDocument
+from tests.support.reports import REPORT
+from tests.support.running_app import serving, until_ready
 
-REPORT: dict[str, Any] = REPORT_EXAMPLES["angle_and_time"]["value"]
 SETTINGS = ServiceSettings()
 
 
@@ -32,14 +33,8 @@ def at(second: float, **more: Any) -> dict[str, Any]:
 @asynccontextmanager
 async def service(table_path: Path, settings: ServiceSettings = SETTINGS) -> AsyncIterator[httpx.AsyncClient]:
     """Run the application, ready to locate."""
-    app = create_app(table_path, settings)
-    async with (
-        app.router.lifespan_context(app),
-        httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test") as http,
-        asyncio.timeout(120),
-    ):
-        while (await http.get("/readyz")).status_code != 200:
-            await asyncio.sleep(0.02)
+    async with serving(create_app(table_path, settings)) as http:
+        await until_ready(http)
         yield http
 
 

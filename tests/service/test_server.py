@@ -10,16 +10,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
 
 from rayfix_service.http.errors import ServiceError
-from rayfix_service.http.examples import REPORT_EXAMPLES
 from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE
 from rayfix_service.http.server import (
     SERVICE_VARIABLE,
@@ -30,12 +27,11 @@ from rayfix_service.http.server import (
 )
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_tables.errors import NotATableError, TableError
+from tests.support.reports import REPORT
+from tests.support.server_process import start_server
 
-REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]
-StartServer = Callable[..., Any]
 
-
-def test_a_real_server_answers_and_ends(hall_table_path: Path, start_server: StartServer):
+def test_a_real_server_answers_and_ends(hall_table_path: Path):
     with start_server(hall_table_path) as server:
         with server.client() as http:
             assert http.get("/livez").status_code == http.get("/readyz").status_code == 200
@@ -66,7 +62,7 @@ def test_a_real_server_answers_and_ends(hall_table_path: Path, start_server: Sta
 
 
 @pytest.mark.slow
-def test_several_workers_share_a_port(hall_table_path: Path, start_server: StartServer):
+def test_several_workers_share_a_port(hall_table_path: Path):
     with start_server(hall_table_path, workers=2) as server:
         for _ in range(4):
             with server.client() as http:
@@ -81,7 +77,7 @@ def test_several_workers_share_a_port(hall_table_path: Path, start_server: Start
     assert "Traceback" not in log
 
 
-def test_requests_under_way_are_finished(hall_table_path: Path, start_server: StartServer):
+def test_requests_under_way_are_finished(hall_table_path: Path):
     batch = {"reports": [REPORT] * 300}
     with start_server(hall_table_path) as server, ThreadPoolExecutor(4) as pool:
 
@@ -109,7 +105,7 @@ def _figure(figures: str, name: str) -> float:
 
 
 @pytest.mark.slow
-def test_a_killed_worker_is_replaced_and_only_its_requests_fail(hall_table_path: Path, start_server: StartServer):
+def test_a_killed_worker_is_replaced_and_only_its_requests_fail(hall_table_path: Path):
     done = threading.Event()
 
     def post() -> tuple[int, list[int]]:
@@ -141,7 +137,7 @@ def test_a_killed_worker_is_replaced_and_only_its_requests_fail(hall_table_path:
     assert {status for _, statuses in results for status in statuses} == {200}
 
 
-def test_the_log_may_be_json(hall_table_path: Path, start_server: StartServer):
+def test_the_log_may_be_json(hall_table_path: Path):
     with start_server(hall_table_path, log_format="json", access_log=True) as server:
         with server.client() as http:
             assert http.post("/v1/positions", json=REPORT, headers={"x-request-id": "r-1"}).status_code == 200

@@ -8,15 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 import trimesh
 
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.http.app import create_app
-from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.web import assets
 from rayfix_service.web.documents import MixtureDocument, mixture_document
 from rayfix_service.web.glb import NO_MATERIAL, write_glb
@@ -28,6 +25,7 @@ from rayfix_tables.errors import ReportError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.mixture import TubeMixture
 from rayfix_tables.table import Scene, Table
+from tests.support.running_app import RunningApp
 
 DEGREE = math.pi / 180.0
 
@@ -37,40 +35,9 @@ def table(hall_table_path: Path) -> Table:
     return Table.open(hall_table_path)
 
 
-class Web:
-    """An application with its loop, ready to answer."""
-
-    def __init__(self, path: Path, *, simulation: bool) -> None:
-        self.app = create_app(path, ServiceSettings(simulation=simulation))
-        self._runner = asyncio.Runner()
-        self._lifespan = self.app.router.lifespan_context(self.app)
-        self._http = httpx.AsyncClient(transport=httpx.ASGITransport(self.app), base_url="http://test")
-
-    def __enter__(self) -> "Web":
-        """Start it."""
-        self._runner.run(self._lifespan.__aenter__())
-        while not self.app.state.tables.became_ready.is_set():
-            self._runner.run(asyncio.sleep(0.01))
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        """Stop it."""
-        self._runner.run(self._lifespan.__aexit__(None, None, None))
-        self._runner.run(self._http.aclose())
-        self._runner.close()
-
-    def get(self, url: str, **options: Any) -> httpx.Response:
-        """GET."""
-        return self._runner.run(self._http.get(url, **options))
-
-    def post(self, url: str, document: Any) -> httpx.Response:
-        """POST a document as JSON."""
-        return self._runner.run(self._http.post(url, json=document))
-
-
 @pytest.fixture(scope="module")
-def web(hall_table_path: Path) -> Iterator[Web]:
-    with Web(hall_table_path, simulation=True) as web:
+def web(hall_table_path: Path) -> Iterator[RunningApp]:
+    with RunningApp(hall_table_path, simulation=True) as web:
         yield web
 
 
@@ -110,7 +77,7 @@ def test_another_library_reads_the_scene_upright_and_to_the_millimetre(offset: f
     np.testing.assert_allclose(found[np.argsort(found[:, :, 1].max(axis=1))], expected[order], atol=1e-3)
 
 
-def test_the_scene_is_given_once(web: Web, table: Table):
+def test_the_scene_is_given_once(web: RunningApp, table: Table):
     response = web.get("/v1/scene.glb")
     assert response.headers["content-type"] == "model/gltf-binary"
     area = read_glb(response.content).area
@@ -124,7 +91,7 @@ def test_the_scene_is_given_once(web: Web, table: Table):
 # --- the inspector -----------------------------------------------------------------------------------------
 
 
-def test_the_mixture_of_a_direction_is_what_the_fusion_uses(web: Web, table: Table):
+def test_the_mixture_of_a_direction_is_what_the_fusion_uses(web: RunningApp, table: Table):
     """An angle alone gives a posterior that is the mixture, before it is cut to the free space."""
     angle = {"station_id": "bs1", "azimuth_deg": 60.0, "zenith_deg": 97.0}
     document = web.get("/v1/stations/bs1/mixture", params={**angle, "stdev_deg": 1.0, "limit": 512}).json()
@@ -174,7 +141,7 @@ def test_the_mass_by_reflections_is_that_of_the_cells(table: Table):
     np.testing.assert_allclose(found, (expected / expected.sum())[: len(found)], rtol=1e-9)
 
 
-def test_coverage_and_refusals(web: Web, table: Table):
+def test_coverage_and_refusals(web: RunningApp, table: Table):
     document = web.get("/v1/stations/bs3/coverage").json()
     assert document["coverage"] == list(table.parts["bs3"].coverage)
     assert [level["window_deg"] for level in document["levels"]] == [2.5, 10.0]
@@ -202,7 +169,7 @@ def test_a_simulated_path_is_one_of_the_forward_solvers(table: Table):
         assert np.any((apart < 0.5) & (off < 0.1) & (exact.num_reflections == path.num_reflections)), station_id
 
 
-def test_a_simulation_is_located_where_it_was(web: Web):
+def test_a_simulation_is_located_where_it_was(web: RunningApp):
     wanted = {"position": list(EXAMPLE_POSITION), "angle_stdev_deg": 0.25, "range_stdev_m": 0.1, "seed": 3}
     document = web.post("/v1/simulations", wanted).json()
     FixDocument.model_validate(document["fix"])
@@ -253,7 +220,7 @@ def test_arrivals_share_a_clock_and_differences_a_reference(table: Table):
         assert difference["range_difference_m"] == pytest.approx(expected, abs=1e-3)
 
 
-def test_places_without_signal_are_refused(web: Web, table: Table):
+def test_places_without_signal_are_refused(web: RunningApp, table: Table):
     with pytest.raises(ReportError, match="in a solid or outside"):
         simulate(table, (-5, 0, 1), kinds=["aoa"], angle_stdev=1, range_stdev=1, rng=np.random.default_rng(1))
     response = web.post("/v1/simulations", {"position": [1, 2], "kinds": ["tod"], "seeds": 1})
@@ -262,14 +229,14 @@ def test_places_without_signal_are_refused(web: Web, table: Table):
 
 
 def test_a_service_may_refuse_to_simulate(hall_table_path: Path):
-    with Web(hall_table_path, simulation=False) as web:
+    with RunningApp(hall_table_path, simulation=False) as web:
         assert web.get("/v1/viewer").json() == {"simulation": False, "max_reflections": 2}
         response = web.post("/v1/simulations", {"position": [1, 2, 1]})
     assert response.status_code == 403
     assert "--allow-simulation" in response.json()["detail"]
 
 
-def test_the_posterior_of_a_report(web: Web, table: Table):
+def test_the_posterior_of_a_report(web: RunningApp, table: Table):
     measurements = simulate(
         table, EXAMPLE_POSITION, kinds=["aoa"], angle_stdev=DEGREE, range_stdev=1, rng=np.random.default_rng(1)
     )[1]
@@ -284,7 +251,7 @@ def test_the_posterior_of_a_report(web: Web, table: Table):
 # --- files -------------------------------------------------------------------------------------------------
 
 
-def test_the_page_and_its_files_are_strict_and_cached(web: Web):
+def test_the_page_and_its_files_are_strict_and_cached(web: RunningApp):
     if not assets.load_assets():
         pytest.skip("the viewer is not built; run make viewer")
     page = web.get("/")
