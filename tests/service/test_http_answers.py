@@ -12,11 +12,11 @@ import pytest
 from rayfix_service.http.problems import Problem
 from rayfix_service.wire import FixDocument
 from rayfix_tables.table import Table
-from tests.support.reports import REPORT, TDOA, changed
+from tests.support.measurements import TDOA, TOA
+from tests.support.reports import REPORT, changed
 from tests.support.running_app import RunningApp
 
 AOA, PT = REPORT["measurements"]
-TOA = {"type": "toa", "station_id": "bs2", "range_m": 131.0, "stdev_m": 0.5}
 
 
 def test_a_report_becomes_a_fix(hall_app: RunningApp):

@@ -6,12 +6,7 @@ from typing import Any
 import httpx
 import pytest
 
-from rayfix_service.http.examples import (
-    BATCH_EXAMPLES,
-    NRPPA_EXAMPLES,
-    SILABS_EXAMPLES,
-    UBLOX_EXAMPLES,
-)
+from rayfix_service.http.examples import BATCH_EXAMPLES, NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.http.outputs import AdaptedFixDocument, Local3dPointUncertaintyEllipsoid, OmloxLocation
 from tests.support.reports import REPORT
 from tests.support.running_app import RunningApp

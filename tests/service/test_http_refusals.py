@@ -11,8 +11,9 @@ import pytest
 
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.http.settings import BodyLimits
+from tests.support.measurements import TDOA
 from tests.support.problems import problem_of
-from tests.support.reports import REPORT, TDOA, changed
+from tests.support.reports import REPORT, changed
 from tests.support.running_app import RunningApp
 
 REFUSED: dict[str, tuple[Any, int, str, list[str]]] = {

@@ -18,13 +18,7 @@ import pytest
 
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE
-from rayfix_service.http.server import (
-    SERVICE_VARIABLE,
-    app_from_environment,
-    check_address,
-    is_loopback,
-    serve,
-)
+from rayfix_service.http.server import SERVICE_VARIABLE, app_from_environment, check_address, is_loopback, serve
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_tables.errors import NotATableError, TableError
 from tests.support.reports import REPORT

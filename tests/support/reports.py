@@ -8,14 +8,6 @@ from rayfix_service.http.examples import REPORT_EXAMPLES
 REPORT: dict[str, Any] = REPORT_EXAMPLES["angle_and_time"]["value"]
 """The example: an angle and a range of one station, of a target at (7.0, 4.0, 1.5)."""
 
-TDOA = {
-    "type": "tdoa",
-    "station_id": "bs2",
-    "reference_station_id": "bs1",
-    "range_difference_m": -4.1,
-    "stdev_m": 0.5,
-}
-
 
 def changed(index: int, *without: str, **values: Any) -> dict[str, Any]:
     """Return the example report with one measurement changed."""
