@@ -13,46 +13,20 @@ from rayfix_offline.engine import EmbreeEngine
 from rayfix_offline.launch import Segments, launch
 from rayfix_offline.materials import Reflectivity, constant_reflectivity
 from rayfix_offline.planes import merge_coplanar
-
-ROOM = ((0.0, 0.0, 0.0), (4.0, 5.0, 3.0))
-CABINET = ((0.5, 1.0, 0.0), (1.3, 2.2, 1.8))
-TABLE = ((2.4, 2.8, 0.9), (3.4, 4.1, 1.1))
-
-
-def box_triangles(low: ArrayLike, high: ArrayLike) -> NDArray[np.float64]:
-    """Triangles of an axis-aligned box, shape (12, 3, 3), m; they face outwards."""
-    return np.array(trimesh.creation.box(bounds=[low, high]).triangles)
-
-
-@pytest.fixture(scope="session")
-def box() -> Callable[..., NDArray[np.float64]]:
-    """Return the function that makes the triangles of a box."""
-    return box_triangles
+from tests.support.rooms import CABINET, ROOM, TABLE, scene_of_boxes
+from tests.support.shapes import box
 
 
 @pytest.fixture(scope="session")
 def room() -> NDArray[np.float64]:
     """Triangles of the empty room, 4 x 5 x 3 m."""
-    return box_triangles(*ROOM)
+    return box(*ROOM)
 
 
 @pytest.fixture(scope="session")
 def clutter() -> NDArray[np.float64]:
-    """Triangles of the room with a cabinet and a table top.
-
-    ::
-
-        y = 5 +-----------------+
-              |          +---+  |      table, z from 0.9 to 1.1
-              |          |   |  |
-              |          +---+  |
-              |   +--+          |
-              |   |  |          |      cabinet, z from 0.0 to 1.8
-              |   +--+          |
-        y = 0 +-----------------+
-            x = 0               4
-    """
-    return np.concatenate([box_triangles(*ROOM), box_triangles(*CABINET), box_triangles(*TABLE)])
+    """Triangles of the room with its cabinet and its table top."""
+    return np.concatenate([box(*ROOM), box(*CABINET), box(*TABLE)])
 
 
 @pytest.fixture(scope="session")
@@ -97,15 +71,8 @@ def unit_vectors() -> Callable[[int, int], NDArray[np.float64]]:
 
 def room_scene() -> trimesh.Scene:
     """Give the room with its cabinet and its table as named objects; the room's triangles face inwards."""
-    scene = trimesh.Scene()
-    walls = trimesh.creation.box(bounds=ROOM)
-    walls.invert()
-    for name, mesh in [
-        ("room", walls),
-        ("cabinet", trimesh.creation.box(bounds=CABINET)),
-        ("table", trimesh.creation.box(bounds=TABLE)),
-    ]:
-        scene.add_geometry(mesh, geom_name=name, node_name=name)
+    scene = scene_of_boxes(room=ROOM, cabinet=CABINET, table=TABLE)
+    scene.geometry["room"].invert()
     return scene
 
 

@@ -18,12 +18,12 @@ from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_tables.angles import tangent
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
+from tests.support.rooms import CABINET, ROOM
+from tests.support.shapes import box
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 Launch = Callable[..., Segments]
 
-ROOM: Box = ((0.0, 0.0, 0.0), (4.0, 5.0, 3.0))
-CABINET: Box = ((0.5, 1.0, 0.0), (1.3, 2.2, 1.8))
 CRATE: Box = ((2.4, 2.8, 0.0), (3.0, 3.4, 0.7))
 MOVED: Box = ((2.4, 3.5, 0.0), (3.0, 4.1, 0.7))
 STATION = np.array([3.6, 0.4, 2.6])
@@ -39,7 +39,7 @@ class Traced:
 
 
 @pytest.fixture(scope="module")
-def trace(box: Callable[..., NDArray[np.float64]], launch_in: Launch) -> Callable[..., Traced]:
+def trace(launch_in: Launch) -> Callable[..., Traced]:
     """Return a function that traces the station among boxes."""
     rays = sample_rays(0.05, np.random.default_rng(0))
 

@@ -8,10 +8,10 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-import trimesh
 
 from rayfix_offline.build import build_table
 from rayfix_tables.errors import BuildError
+from tests.support.rooms import room_with_crate
 
 SITE = """\
 [site]
@@ -35,10 +35,7 @@ position_m = [3.5, 0.6, 2.5]
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Site of a room of 4 x 5 x 3 m with a box in it."""
     folder = tmp_path_factory.mktemp("cluster")
-    room = trimesh.creation.box(bounds=[(0, 0, 0), (4, 5, 3)])
-    room.invert()
-    clutter = trimesh.creation.box(bounds=[(1.5, 2.0, 0.2), (2.5, 3.0, 1.2)])
-    trimesh.util.concatenate([room, clutter]).export(folder / "room.ply")
+    room_with_crate().export(folder / "room.ply")
     (folder / "site.toml").write_text(SITE, encoding="utf-8")
     return folder / "site.toml"
 

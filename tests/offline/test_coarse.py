@@ -20,6 +20,7 @@ from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_offline.twin import prepare_twin
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture, joint_cov
+from tests.support.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_boxes
 
 Array = NDArray[np.float64]
 WIDE = np.deg2rad(12.0)
@@ -31,17 +32,9 @@ def fine(
     tmp_path_factory: pytest.TempPathFactory, site_document: Callable[..., dict[str, Any]]
 ) -> tuple[LevelRays, Level]:
     """Rays and cells of 3 deg in the room with two boxes, two reflections, for a station in its corner."""
-    scene = trimesh.Scene()
-    for name, bounds in [
-        ("room", [(0, 0, 0), (4, 5, 3)]),
-        ("cabinet", [(0.5, 1.0, 0.0), (1.3, 2.2, 1.8)]),
-        ("table", [(2.4, 2.8, 0.9), (3.4, 4.1, 1.1)]),
-    ]:
-        scene.add_geometry(trimesh.creation.box(bounds=bounds), geom_name=name, node_name=name)
-    folder = tmp_path_factory.mktemp("room")
-    (folder / "room.glb").write_bytes(scene.export(file_type="glb"))
+    scene = scene_of_boxes(room=ROOM, cabinet=CABINET, table=TABLE)
     site = parse_site(site_document(propagation={"max_reflections": 2}, table={"windows_deg": [3.0]}))
-    rays = trace_station(site.stations[0], site, prepare_twin(site, folder)).finest
+    rays = finest_level(tmp_path_factory.mktemp("room"), scene, site)
     cells = np.arange(rays.grid.num_cells)
     return rays, assemble_level(rays.window, rays.grid, [fit_cells(cells, rays, site)])
 

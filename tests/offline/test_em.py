@@ -5,17 +5,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from numpy.typing import NDArray
 
 from rayfix_offline.em import ExpectationMaximisation, fit_em, sample_points
 from rayfix_offline.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR
 from rayfix_offline.site import parse_site
-from rayfix_offline.trace import LevelRays, trace_station
+from rayfix_offline.trace import LevelRays
 from rayfix_offline.tubes import TubeFit, fit_tubes
-from rayfix_offline.twin import prepare_twin
 from rayfix_tables.angles import direction
 from rayfix_tables.mixture import FIELD_SHAPES, unpack
+from tests.support.rooms import CABINET, ROOM, finest_level, scene_of_boxes
 
 CELLS = np.array([250, 100, 3])
 FEW = ExpectationMaximisation(num_points=1000, num_components=(2, 6), seed=3)
@@ -24,13 +23,8 @@ FEW = ExpectationMaximisation(num_points=1000, num_components=(2, 6), seed=3)
 @pytest.fixture(scope="module")
 def level(tmp_path_factory: pytest.TempPathFactory, site_document: Callable[..., dict[str, Any]]) -> LevelRays:
     """Trace the room with one box at a window of 10 deg, one reflection."""
-    folder = tmp_path_factory.mktemp("room")
-    scene = trimesh.Scene()
-    for name, bounds in [("room", [(0, 0, 0), (4, 5, 3)]), ("cabinet", [(0.5, 1.0, 0.0), (1.3, 2.2, 1.8)])]:
-        scene.add_geometry(trimesh.creation.box(bounds=bounds), geom_name=name, node_name=name)
-    (folder / "room.glb").write_bytes(scene.export(file_type="glb"))
-    site = parse_site(site_document())
-    return trace_station(site.stations[0], site, prepare_twin(site, folder)).finest
+    scene = scene_of_boxes(room=ROOM, cabinet=CABINET)
+    return finest_level(tmp_path_factory.mktemp("room"), scene, parse_site(site_document()))
 
 
 def moments_of_pieces(level: LevelRays, cell: int) -> tuple[NDArray[np.float64], float, float]:

@@ -9,33 +9,18 @@ import trimesh
 from numpy.typing import NDArray
 
 from rayfix_offline.enclosures import find_enclosures
-from rayfix_offline.scene import Scene
-from rayfix_offline.site import read_site
 from rayfix_offline.solids import split_parts
 from rayfix_offline.topology import find_topology
-from rayfix_offline.twin import Twin, prepare_twin
+from tests.support.rooms import scene_of, twin_of
+from tests.support.shapes import box
 
-Box = Callable[..., NDArray[np.float64]]
 WriteSite = Callable[..., Path]
 Point = tuple[float, float, float]
 
 
-def scene_of(objects: dict[str, NDArray[np.float64]]) -> Scene:
-    """Scene of named triangles."""
-    triangles = np.concatenate(list(objects.values()))
-    return Scene(
-        vertices=triangles.reshape(-1, 3),
-        faces=np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3),
-        face_materials=np.full(len(triangles), -1, np.int16),
-        materials=(),
-        face_objects=np.repeat(np.arange(len(objects)), [len(t) for t in objects.values()]).astype(np.int32),
-        objects=tuple(objects),
-    )
-
-
 def kinds(objects: dict[str, NDArray[np.float64]], *stations: Point) -> dict[str, str]:
     """Say of each object whether it is a room, a shell around rooms, or a solid."""
-    scene = scene_of(objects)
+    scene = scene_of(**objects)
     parts = split_parts(scene, find_topology(scene))
     found = find_enclosures(scene, parts, np.array(stations))
     return {
@@ -44,19 +29,19 @@ def kinds(objects: dict[str, NDArray[np.float64]], *stations: Point) -> dict[str
     }
 
 
-def test_two_halls_with_half_of_the_stations_each(box: Box) -> None:
+def test_two_halls_with_half_of_the_stations_each() -> None:
     halls = {"a": box((0, 0, 0), (10, 10, 4)), "b": box((20, 0, 0), (30, 10, 4)), "crate": box((3, 3, 0), (4, 4, 1))}
     expected = {"a": "room", "b": "room", "crate": "solid"}
     assert kinds(halls, (1, 1, 3), (21, 1, 3)) == expected
     assert kinds(halls, (1, 1, 3), (21, 1, 3), (2, 8, 3), (29, 8, 3)) == expected
 
 
-def test_three_halls(box: Box) -> None:
+def test_three_halls() -> None:
     halls = {name: box((20 * n, 0, 0), (20 * n + 10, 10, 4)) for n, name in enumerate("abc")}
     assert kinds(halls, (1, 1, 3), (21, 1, 3), (41, 1, 3)) == dict.fromkeys("abc", "room")
 
 
-def test_a_lone_station_in_a_large_solid(box: Box) -> None:
+def test_a_lone_station_in_a_large_solid() -> None:
     """The machine takes up 48 of 120 m3, but crates stand beside it."""
     room = {"room": box((0, 0, 0), (6, 5, 4)), "machine": box((1, 1, 0), (5, 5, 3))}
     crates = {f"crate {n}": box((0.2, 0.2 + n, 0), (0.6, 0.6 + n, 1)) for n in range(3)}
@@ -66,7 +51,7 @@ def test_a_lone_station_in_a_large_solid(box: Box) -> None:
     assert kinds(room, (2, 2, 1)) == {"room": "room", "machine": "solid"}
 
 
-def test_walls_with_two_faces_around_two_rooms(box: Box) -> None:
+def test_walls_with_two_faces_around_two_rooms() -> None:
     flat = {"shell": box((-0.3, -0.3, -0.3), (10.3, 5.3, 3.3))}
     rooms = {"left": box((0, 0, 0), (4.9, 5, 3)), "right": box((5.1, 0, 0), (10, 5, 3))}
     crate = {"crate": box((1, 1, 0), (2, 2, 1))}
@@ -76,15 +61,10 @@ def test_walls_with_two_faces_around_two_rooms(box: Box) -> None:
     assert kinds({**flat, **rooms, **crate}, (0.5, 0.5, 2), (0.5, 4.5, 2))["right"] == "solid"
 
 
-def test_a_station_in_a_rack_of_an_open_yard(box: Box) -> None:
+def test_a_station_in_a_rack_of_an_open_yard() -> None:
     """Without a building: the other stations are in no closed part at all."""
     yard = {"rack": box((0, 0, 0), (8, 2, 4)), "shed": box((0, 8, 0), (8, 10, 4))}
     assert kinds(yard, (1, 1, 1), (4, 5, 3), (5, 5, 3)) == {"rack": "solid", "shed": "solid"}
-
-
-def twin_of(path: Path) -> Twin:
-    """Prepare the twin of a site file."""
-    return prepare_twin(read_site(path), path.parent)
 
 
 def test_the_free_space_of_two_halls(tmp_path: Path, write_site: WriteSite) -> None:

@@ -6,24 +6,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rayfix_offline.launch import Segments, launch
 from rayfix_offline.materials import constant_reflectivity
 from rayfix_offline.planes import merge_coplanar
 from rayfix_offline.rays import sample_rays
+from tests.support.shapes import quad
 
 Launch = Callable[..., Segments]
 Vectors = Callable[[int, int], NDArray[np.float64]]
 SIZE = np.array([4.0, 5.0, 3.0])
 STATION = np.array([3.6, 0.4, 2.6])
 EXACT = 1e-9  # m
-
-
-def quad(*corners: ArrayLike) -> NDArray[np.float64]:
-    """Two triangles, shape (2, 3, 3), m."""
-    a, b, c, d = np.array(corners, dtype=float)
-    return np.array([[a, b, c], [a, c, d]])
 
 
 def points_at(segments: Segments, directions: NDArray[np.float64], length: NDArray[np.float64]) -> NDArray[np.float64]:

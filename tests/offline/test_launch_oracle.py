@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from rayfix.evaluation.forward import ForwardSolver
 from rayfix_offline.launch import Segments
 from rayfix_tables.angles import direction
+from tests.support.shapes import box, cut_in_three
 
 Launch = Callable[..., Segments]
 Vectors = Callable[[int, int], NDArray[np.float64]]
@@ -34,7 +35,7 @@ def points_at(
 
 
 @pytest.fixture(scope="module")
-def clutter(clutter: NDArray[np.float64], box: Callable[..., NDArray[np.float64]]) -> NDArray[np.float64]:
+def clutter(clutter: NDArray[np.float64]) -> NDArray[np.float64]:
     """Add a crate that hangs askew in the cluttered room, since reflections at right angles can be swapped."""
     crate = Rotation.from_euler("xyz", (15, 25, 40), degrees=True).apply(box((0, 0, 0), (0.8, 0.7, 0.6)).reshape(-1, 3))
     return np.concatenate([clutter, crate.reshape(-1, 3, 3) + np.array((1.8, 2.0, 1.4))])
@@ -144,10 +145,7 @@ def test_order_of_triangles_and_vertices(
 def test_splitting_triangles(
     clutter: NDArray[np.float64], launch_in: Launch, rays: NDArray[np.float64], reference: Segments
 ) -> None:
-    middle = (clutter * np.array([0.5, 0.3, 0.2])[:, None]).sum(axis=1)
-    a, b, c = (clutter[:, i] for i in range(3))
-    pieces = np.concatenate([np.stack(t, axis=1) for t in ((a, b, middle), (b, c, middle), (c, a, middle))])
-    assert_same_rays(launch_in(pieces, STATION, rays), reference)
+    assert_same_rays(launch_in(cut_in_three(clutter), STATION, rays), reference)
 
 
 @settings(max_examples=10, deadline=None)
@@ -172,7 +170,6 @@ def test_a_far_object(
     launch_in: Launch,
     rays: NDArray[np.float64],
     reference: Segments,
-    box: Callable[..., NDArray[np.float64]],
 ) -> None:
     """Behind the walls, 40 m away and askew, so that it shares no plane with the room.
 

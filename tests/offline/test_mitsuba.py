@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.scene import Scene, load_scene
 from rayfix_tables.errors import SceneError
+from tests.support.refusals import refusal
 
 SINGLE = 1e-5  # m; PLY files of trimesh store single precision
 
@@ -42,12 +43,7 @@ def refused(folder: Path, content: str | bytes) -> str:
     """Check that a file is refused in one line that names it, and return that line."""
     path = folder / "scene.xml"
     path.write_bytes(content.encode() if isinstance(content, str) else content)
-    with pytest.raises(SceneError) as caught:
-        load_scene(path)
-    message = str(caught.value)
-    assert str(path) in message
-    assert "\n" not in message
-    return message
+    return refusal(SceneError, load_scene, path)
 
 
 def refused_scene(folder: Path, content: str) -> str:

@@ -11,6 +11,7 @@ from rayfix_offline.launch import Segments
 from rayfix_offline.pathprior import PathPrior, fill_path_prior, reflection_factors
 from rayfix_offline.rays import RaySet, sample_rays
 from rayfix_tables.freespace import FreeSpace
+from tests.support.shapes import box
 
 Launch = Callable[..., Segments]
 STATION = np.array([1.0, 1.0, 1.0])
@@ -145,9 +146,7 @@ def test_a_shadow_is_not_covered(rays: RaySet, clutter: NDArray[np.float64], lau
     np.testing.assert_array_equal(prior.total[5:13, 10:22, :18][1:-1, 1:-1, :-1], 0.0)
 
 
-def test_voxels_that_a_solid_cuts_are_lit_over_their_free_part(
-    rays: RaySet, launch_in: Launch, box: Callable[..., NDArray[np.float64]]
-) -> None:
+def test_voxels_that_a_solid_cuts_are_lit_over_their_free_part(rays: RaySet, launch_in: Launch) -> None:
     """A floor slab of 0.5 m in voxels of 0.2 m: the third layer is half free, and as bright as it would be."""
     slab = box((0, 0, 0), (4, 5, 0.5))
     scene = np.concatenate([box((0, 0, 0), (4, 5, 3)), slab])

@@ -1,36 +1,21 @@
 """Coplanar triangles are one mirror; nothing else is."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rayfix_offline.planes import TOLERANCE, Planes, merge_coplanar
+from tests.support.shapes import box, cut_in_three, quad
 
-Box = Callable[..., NDArray[np.float64]]
 EXACT = 1e-12  # m, of coordinates of a few metres
-
-
-def quad(*corners: ArrayLike) -> NDArray[np.float64]:
-    """Two triangles, shape (2, 3, 3), m."""
-    a, b, c, d = np.array(corners, dtype=float)
-    return np.array([[a, b, c], [a, c, d]])
 
 
 def square(x: float, y: float, z: float = 0.0, *, size: float = 1.0) -> NDArray[np.float64]:
     """Horizontal square with its low corner at a point."""
     return quad((x, y, z), (x + size, y, z), (x + size, y + size, z), (x, y + size, z))
-
-
-def split(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cut every triangle into three at a point inside."""
-    middle = (triangles * np.array([0.5, 0.3, 0.2])[:, None]).sum(axis=1)
-    a, b, c = (triangles[:, i] for i in range(3))
-    return np.concatenate([np.stack(t, axis=1) for t in ((a, b, middle), (b, c, middle), (c, a, middle))])
 
 
 def assert_on_planes(triangles: NDArray[np.float64], planes: Planes, *, atol: float = EXACT) -> None:
@@ -117,7 +102,7 @@ def test_merged_planes_are_their_mean_by_area() -> None:
     assert_on_planes(triangles, planes, atol=TOLERANCE)
 
 
-def test_two_boxes_share_only_what_is_coplanar(box: Box) -> None:
+def test_two_boxes_share_only_what_is_coplanar() -> None:
     """Boxes beside each other on one floor, of equal depth: floor, and two walls along x, are common."""
     triangles = np.concatenate([box((0, 0, 0), (1, 2, 1)), box((3, 0, 0), (4, 2, 2))])
     planes = merge_coplanar(triangles)
@@ -130,7 +115,7 @@ def test_two_boxes_share_only_what_is_coplanar(box: Box) -> None:
 def test_splitting_and_reordering_change_nothing(clutter: NDArray[np.float64], seed: int) -> None:
     rng = np.random.default_rng(seed)
     whole = merge_coplanar(clutter)
-    pieces = merge_coplanar(split(clutter))
+    pieces = merge_coplanar(cut_in_three(clutter))
     assert same_grouping(pieces.face_planes, np.tile(whole.face_planes, 3))
     order = rng.permutation(len(clutter))
     corners = np.array([rng.permutation(3) for _ in order])

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 from rayfix_offline.build import BuildSummary, build_table
 from rayfix_offline.shards import ShardStore
 from rayfix_tables.errors import BuildError
 from rayfix_tables.site import NO_BIAS
 from rayfix_tables.table import Table
+from tests.support.rooms import room_with_crate
 
 SITE = """\
 [site]
@@ -36,10 +36,7 @@ STATIONS = {"a": (0.4, 0.5), "b": (3.5, 0.6), "c": (2.0, 4.5)}
 def write_site(folder: Path, stations: dict[str, tuple[float, float]], *, seed: int = 1, box: float = 1.0) -> Path:
     """Write a room of 4 x 5 x 3 m with a box of 1 x 1 m in it, ``box`` m high, and its site file."""
     folder.mkdir(exist_ok=True)
-    room = trimesh.creation.box(bounds=[(0, 0, 0), (4, 5, 3)])
-    room.invert()
-    clutter = trimesh.creation.box(bounds=[(1.5, 2.0, 0.2), (2.5, 3.0, 0.2 + box)])
-    trimesh.util.concatenate([room, clutter]).export(folder / "room.ply")
+    room_with_crate(box).export(folder / "room.ply")
     text = SITE.format(seed=seed) + "".join(STATION.format(id=i, x=x, y=y) for i, (x, y) in stations.items())
     (folder / "site.toml").write_text(text, encoding="utf-8")
     return folder / "site.toml"

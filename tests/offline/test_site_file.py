@@ -9,6 +9,7 @@ import pytest
 
 from rayfix_offline.site import parse_site, read_site
 from rayfix_tables.errors import SiteError
+from tests.support.refusals import refusal
 
 Document = Callable[..., dict[str, Any]]
 
@@ -206,12 +207,7 @@ def test_a_file(tmp_path: Path, write_site: Callable[..., Path]) -> None:
 
 def file_refused(path: Path) -> str:
     """Check that a file is refused in one line that names it, and return that line."""
-    with pytest.raises(SiteError) as caught:
-        read_site(path)
-    message = str(caught.value)
-    assert str(path) in message
-    assert "\n" not in message
-    return message
+    return refusal(SiteError, read_site, path)
 
 
 def test_a_missing_file(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Parts of a mesh, insides, and the free space, against analytic boxes and spheres."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,22 +16,10 @@ from rayfix_offline.scene import Scene
 from rayfix_offline.solids import Part, is_inside, map_free_space, split_parts, touched
 from rayfix_offline.topology import find_topology
 from rayfix_tables.freespace import FreeSpace
+from tests.support.rooms import scene_of
+from tests.support.shapes import box
 
-Box = Callable[..., NDArray[np.float64]]
 seeds = st.integers(0, 2**32 - 1)
-
-
-def scene_of(**objects: NDArray[np.float64]) -> Scene:
-    """Scene of named triangles, each with vertices of its own."""
-    triangles = np.concatenate(list(objects.values()))
-    return Scene(
-        vertices=triangles.reshape(-1, 3),
-        faces=np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3),
-        face_materials=np.full(len(triangles), -1, np.int16),
-        materials=(),
-        face_objects=np.repeat(np.arange(len(objects)), [len(t) for t in objects.values()]).astype(np.int32),
-        objects=tuple(objects),
-    )
 
 
 def parts_of(scene: Scene) -> tuple[Part, ...]:
@@ -61,7 +48,7 @@ def test_parts_of_a_room(clutter: NDArray[np.float64]) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(seeds)
-def test_volume_does_not_depend_on_the_place(box: Box, seed: int) -> None:
+def test_volume_does_not_depend_on_the_place(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size = rng.uniform(0.1, 3.0, 3)
     triangles = moved(box(-size / 2, size / 2), Rotation.random(rng=rng), rng.uniform(-1e3, 1e3, 3))
@@ -70,20 +57,20 @@ def test_volume_does_not_depend_on_the_place(box: Box, seed: int) -> None:
     assert part.volume == pytest.approx(np.prod(size), rel=1e-9)
 
 
-def test_a_missing_triangle_opens_a_part(box: Box) -> None:
+def test_a_missing_triangle_opens_a_part() -> None:
     (part,) = parts_of(scene_of(crate=box((0, 0, 0), (1, 1, 1))[1:]))
     assert not part.closed
     assert not part.consistent
 
 
-def test_one_turned_triangle(box: Box) -> None:
+def test_one_turned_triangle() -> None:
     triangles = box((0, 0, 0), (1, 1, 1))
     triangles[4] = triangles[4, ::-1]
     (part,) = parts_of(scene_of(crate=triangles))
     assert (part.closed, part.consistent) == (True, False)
 
 
-def test_boxes_that_touch_along_an_edge_are_one_closed_part(box: Box) -> None:
+def test_boxes_that_touch_along_an_edge_are_one_closed_part() -> None:
     """Four triangles meet at the common edge."""
     one, other = box((0, 0, 0), (1, 1, 1)), box((1, 1, 0), (3, 2, 1))
     assert [part.closed for part in parts_of(scene_of(a=one, b=other))] == [True, True]
@@ -92,7 +79,7 @@ def test_boxes_that_touch_along_an_edge_are_one_closed_part(box: Box) -> None:
     assert part.volume == pytest.approx(3.0, rel=1e-12)
 
 
-def test_a_partition_of_one_sheet_opens_a_part(box: Box) -> None:
+def test_a_partition_of_one_sheet_opens_a_part() -> None:
     """Three triangles meet at its rim: what lies behind it is neither inside nor outside."""
     walls = np.concatenate([box((0, 0, 0), (1, 1, 1)), box((0, 0, 1), (1, 1, 2))])
     sheet = np.all(walls[:, :, 2] == 1.0, axis=1)
@@ -102,7 +89,7 @@ def test_a_partition_of_one_sheet_opens_a_part(box: Box) -> None:
     assert not parts_of(scene_of(crate=once))[0].closed
 
 
-def test_a_seam_below_a_micrometre_is_none(box: Box) -> None:
+def test_a_seam_below_a_micrometre_is_none() -> None:
     triangles = box((0, 0, 0), (1, 1, 1))
     (part,) = parts_of(scene_of(crate=triangles + np.random.default_rng(0).uniform(-1e-9, 1e-9, triangles.shape)))
     assert part.closed
@@ -118,7 +105,7 @@ def test_a_sheet_is_open() -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(seeds)
-def test_inside_a_box(box: Box, seed: int) -> None:
+def test_inside_a_box(seed: int) -> None:
     """Whatever its place, its turn and the way its triangles face."""
     rng = np.random.default_rng(seed)
     size = rng.uniform(0.2, 4.0, 3)
@@ -165,7 +152,7 @@ def test_inside_a_sphere() -> None:
     np.testing.assert_array_equal(found[clear], radius[clear] < inner)
 
 
-def test_inside_a_hollow_shell(box: Box) -> None:
+def test_inside_a_hollow_shell() -> None:
     shell = np.concatenate([box((0, 0, 0), (4, 4, 4)), box((1, 1, 1), (3, 3, 3))])
     assert is_inside(shell, np.array([0.5, 2.1, 2.2]))
     assert not is_inside(shell, np.array([2.1, 2.2, 2.3]))
@@ -174,7 +161,7 @@ def test_inside_a_hollow_shell(box: Box) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(seeds)
-def test_touching_a_box(box: Box, seed: int) -> None:
+def test_touching_a_box(seed: int) -> None:
     """Points on the surface, moved along the outward normal by up to 3 mm; 1 mm counts as on it."""
     rng = np.random.default_rng(seed)
     size, rotation, shift = rng.uniform(0.2, 4.0, 3), Rotation.random(rng=rng), rng.uniform(-50, 50, 3)
@@ -210,7 +197,7 @@ def test_the_room_encloses_and_the_solids_do_not(clutter: NDArray[np.float64]) -
     assert inside == {"room": [True] * 3, "cabinet": [False] * 3, "table": [False] * 3}
 
 
-def test_walls_with_two_faces(box: Box, room: NDArray[np.float64]) -> None:
+def test_walls_with_two_faces(room: NDArray[np.float64]) -> None:
     """The inner and the outer face of the walls both enclose; a station between them is in the outer one only."""
     scene = scene_of(inner=room, outer=box((-0.3, -0.3, -0.3), (4.3, 5.3, 3.3)))
     found, inside = enclosures(scene, *STATIONS, (4.1, 2.0, 1.0))
@@ -225,7 +212,7 @@ def test_a_station_in_a_small_solid_does_not_make_it_a_building(clutter: NDArray
     assert inside == {"room": [True], "cabinet": [True], "table": [False]}
 
 
-def test_one_station_in_a_large_machine_does_not_make_it_a_building(room: NDArray[np.float64], box: Box) -> None:
+def test_one_station_in_a_large_machine_does_not_make_it_a_building(room: NDArray[np.float64]) -> None:
     """The machine takes up 8 of 60 m3; most stations are outside of it."""
     scene = scene_of(room=room, machine=box((1, 1, 0.5), (3, 3, 2.5)))
     found, inside = enclosures(scene, (2.0, 2.1, 1.0), *STATIONS)
@@ -278,7 +265,7 @@ def test_a_room_that_does_not_enclose_is_solid(room: NDArray[np.float64]) -> Non
 
 @settings(max_examples=15, deadline=None)
 @given(seeds)
-def test_free_space_around_turned_boxes(box: Box, seed: int) -> None:
+def test_free_space_around_turned_boxes(seed: int) -> None:
     """Two boxes, turned any way, which may overlap, in an axis-aligned room."""
     rng = np.random.default_rng(seed)
     objects, solid = {"room": box((-3, -3, -3), (3, 3, 3))}, []
@@ -326,7 +313,7 @@ def test_an_open_part_is_not_solid(clutter: NDArray[np.float64]) -> None:
     assert free.all()
 
 
-def test_a_large_scene_gets_larger_voxels(box: Box, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_scene_gets_larger_voxels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solids, "MAX_VOXELS", 10_000)
     scene = scene_of(hall=box((0, 0, 0), (80, 180, 25)))
     space = mapped(scene, [True], 0.1)

@@ -1,7 +1,6 @@
 """Facets of curved surfaces: which make up one surface, and that flat mirrors stay as they are."""
 
 import itertools
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,30 +11,18 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from rayfix_offline.planes import Planes, merge_coplanar
-from rayfix_offline.scene import Scene
 from rayfix_offline.surfaces import FACET_SIZE, SURFACE_ANGLE, join_facets
 from rayfix_offline.topology import find_topology, number_rows
+from tests.support.rooms import scene_of
+from tests.support.shapes import box
 
 Triangles = NDArray[np.float64]
-Box = Callable[..., Triangles]
-
-
-def scene_of(triangles: Triangles) -> Scene:
-    """Scene of one object whose triangles share no vertices."""
-    return Scene(
-        vertices=triangles.reshape(-1, 3),
-        faces=np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3),
-        face_materials=np.full(len(triangles), -1, np.int16),
-        materials=(),
-        face_objects=np.zeros(len(triangles), np.int32),
-        objects=("mesh",),
-    )
 
 
 def joined(triangles: Triangles) -> tuple[Planes, Planes]:
     """Planes before and after facets are joined."""
     planes = merge_coplanar(triangles)
-    return planes, join_facets(triangles, planes, find_topology(scene_of(triangles)))
+    return planes, join_facets(triangles, planes, find_topology(scene_of(mesh=triangles)))
 
 
 def surfaces_of(triangles: Triangles) -> NDArray[np.int32]:
@@ -163,7 +150,7 @@ def test_coplanar_facets_of_two_pillars_are_two_mirrors() -> None:
     assert set(first[~side]) == set(second[~side])
 
 
-def test_a_subdivided_wall_is_flat(box: Box) -> None:
+def test_a_subdivided_wall_is_flat() -> None:
     mesh = trimesh.Trimesh(*trimesh.triangles.to_kwargs(box((0, 0, 0), (4, 5, 3))).values())
     for _ in range(4):
         mesh = mesh.subdivide()

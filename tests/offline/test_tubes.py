@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,23 +11,16 @@ from numpy.typing import NDArray
 
 from rayfix_offline.em import ExpectationMaximisation, fit_em, sample_points
 from rayfix_offline.moments import CUTOFF, POSITION_FLOOR
-from rayfix_offline.site import SiteFile, parse_site
-from rayfix_offline.trace import LevelRays, trace_station
+from rayfix_offline.site import parse_site
+from rayfix_offline.trace import LevelRays
 from rayfix_offline.tubes import TubeFit, fit_tubes
-from rayfix_offline.twin import prepare_twin
 from rayfix_tables.angles import direction, tangent
 from rayfix_tables.mixture import TubeMixture, unpack, widening_cov
+from tests.support.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_boxes
 
 Array = NDArray[np.float64]
 STATION = np.array([3.6, 0.4, 2.6])
 INSIDE = 1.0 - np.exp(-(CUTOFF**2) / 2.0)  # share of a cell's window within its cut-off
-
-
-def level_of(folder: Path, scene: trimesh.Scene, document: dict[str, Any]) -> LevelRays:
-    """Trace the first station of a site and give its first level."""
-    (folder / "room.glb").write_bytes(scene.export(file_type="glb"))
-    site: SiteFile = parse_site(document)
-    return trace_station(site.stations[0], site, prepare_twin(site, folder)).finest
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +28,7 @@ def empty_level(tmp_path_factory: pytest.TempPathFactory, site_document: Callabl
     """Trace the empty room at a window of 5 deg, without reflections and with s^2 alone as weight."""
     scene = trimesh.Scene(trimesh.creation.box(bounds=[(0, 0, 0), (4, 5, 3)]))
     document = site_document(propagation={"max_reflections": 0, "path_prior": "uniform"}, table={"windows_deg": [5.0]})
-    return level_of(tmp_path_factory.mktemp("empty"), scene, document)
+    return finest_level(tmp_path_factory.mktemp("empty"), scene, parse_site(document))
 
 
 @pytest.fixture(scope="module")
@@ -44,15 +36,9 @@ def cluttered_level(
     tmp_path_factory: pytest.TempPathFactory, site_document: Callable[..., dict[str, Any]]
 ) -> LevelRays:
     """Trace the room with two boxes at a window of 5 deg, two reflections, the default prior."""
-    scene = trimesh.Scene()
-    for name, bounds in [
-        ("room", [(0, 0, 0), (4, 5, 3)]),
-        ("cabinet", [(0.5, 1.0, 0.0), (1.3, 2.2, 1.8)]),
-        ("table", [(2.4, 2.8, 0.9), (3.4, 4.1, 1.1)]),
-    ]:
-        scene.add_geometry(trimesh.creation.box(bounds=bounds), geom_name=name, node_name=name)
+    scene = scene_of_boxes(room=ROOM, cabinet=CABINET, table=TABLE)
     document = site_document(propagation={"max_reflections": 2}, table={"windows_deg": [5.0]})
-    return level_of(tmp_path_factory.mktemp("cluttered"), scene, document)
+    return finest_level(tmp_path_factory.mktemp("cluttered"), scene, parse_site(document))
 
 
 def cells_of(mixture: TubeMixture, counts: NDArray[np.int64]) -> list[TubeMixture]:

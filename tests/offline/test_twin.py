@@ -9,17 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from rayfix_offline.site import read_site
-from rayfix_offline.twin import Twin, prepare_twin, refuse_errors
+from rayfix_offline.twin import Twin, refuse_errors
 from rayfix_tables.errors import SceneError
+from tests.support.rooms import twin_of
 
 WriteSite = Callable[..., Path]
 Stations = list[dict[str, Any]]
-
-
-def twin_of(path: Path) -> Twin:
-    """Prepare the twin of a site file."""
-    return prepare_twin(read_site(path), path.parent)
 
 
 def messages(twin: Twin, severity: str) -> list[str]:

@@ -13,6 +13,7 @@ from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATabl
 from rayfix_tables.mixture import FIELD_SHAPES
 from rayfix_tables.schema import LEVEL_DATASETS, SCENE_DATASETS
 from rayfix_tables.table import Table
+from tests.support.refusals import refusal
 
 REBUILD = "restore it from a copy or build it again"
 LEVEL = "stations/bs1/levels/1"
@@ -36,12 +37,7 @@ ATTRIBUTES = [
 
 def refused(path: Path, kind: type[TableError], remedy: str, *, read: Callable[[Path], Any] = Table.open) -> str:
     """Check that a file is refused for this reason, exactly, in one line; return that line."""
-    with pytest.raises(TableError) as caught:
-        read(path)
-    assert type(caught.value) is kind
-    message = str(caught.value)
-    assert "\n" not in message
-    assert str(path) in message
+    message = refusal(kind, read, path)
     assert remedy in message
     return message
 
