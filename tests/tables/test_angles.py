@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_tables.angles import angles_of, direction, local_to_scene, tangent, wrap
+from rayfix_tables.angles import angles_of, direction, local_to_scene, tangent, wrap, wrap_one
 
 ROUNDING = 1e-15  # of numbers of size 1
 angles = st.floats(-1e4, 1e4)
@@ -47,6 +47,14 @@ def test_wrap_leaves_what_is_wrapped(azimuth: float) -> None:
 )
 def test_wrap_at_the_seam(angle: float, wrapped: float) -> None:
     assert float(wrap(angle)) == wrapped
+    assert wrap_one(angle) == wrapped
+
+
+@settings(deadline=None)
+@given(st.floats(-3.0 * np.pi, 3.0 * np.pi))
+def test_one_angle_is_wrapped_as_arrays_are(angle: float) -> None:
+    # Whole turns come off exactly, so that only the seam's two ends might be told apart.
+    assert wrap_one(angle) == float(wrap(angle))
 
 
 def test_wrap_next_to_all_half_turns() -> None:

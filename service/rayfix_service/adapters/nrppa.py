@@ -26,7 +26,7 @@ from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_i
 from rayfix_service.fusion.directions import to_scene
 from rayfix_service.fusion.report import Angle, Measurement, Range, TimeOfArrival
 from rayfix_service.wire.problems import Path
-from rayfix_tables.angles import wrap
+from rayfix_tables.angles import wrap_one
 from rayfix_tables.site import Station
 
 _RESOLUTION_M = {"m0dot1": 0.1, "mdot1": 0.1, "m1": 1.0, "m10": 10.0, "m30": 30.0}
@@ -136,7 +136,7 @@ class _Converter:
                 return _NO_ZENITH
             return Angle(
                 station_id=self.station_id,
-                azimuth=float(wrap(azimuth.middle + turn)),
+                azimuth=wrap_one(azimuth.middle + turn),
                 azimuth_stdev=azimuth_stdev,
                 frame="north",
             )
@@ -145,7 +145,7 @@ class _Converter:
         zenith_stdev = math.sqrt((default if known is None else _steps(known) * ANGLE_STEP) ** 2 + zenith.variance)
         angle = Angle(
             station_id=self.station_id,
-            azimuth=float(wrap(azimuth.middle)),
+            azimuth=wrap_one(azimuth.middle),
             zenith=zenith.middle,
             azimuth_stdev=azimuth_stdev,
             zenith_stdev=zenith_stdev,

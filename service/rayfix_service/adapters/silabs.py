@@ -16,7 +16,7 @@ from rayfix_service.fusion.report import Angle, Frame, Measurement, Range
 from rayfix_service.wire import MAX_MEASUREMENTS, WireModel
 from rayfix_service.wire.fields import misfit
 from rayfix_service.wire.problems import Path
-from rayfix_tables.angles import wrap
+from rayfix_tables.angles import wrap_one
 
 _Stdev = Field(ge=0, le=360, description="a standard deviation in degrees, 0 to 360")
 
@@ -130,7 +130,7 @@ def silabs_measurements(
     least = math.radians(least_stdev_deg)
     measured = Angle(
         station_id=station_id,
-        azimuth=float(wrap(math.radians(-angle.azimuth))),
+        azimuth=wrap_one(math.radians(-angle.azimuth)),
         azimuth_stdev=max(math.radians(angle.azimuth_stdev), least),
         zenith=None if angle.elevation is None else math.radians(90.0 - angle.elevation),
         zenith_stdev=None if angle.elevation_stdev is None else max(math.radians(angle.elevation_stdev), least),

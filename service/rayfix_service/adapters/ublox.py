@@ -11,7 +11,7 @@ from rayfix_service.adapters.joining import Joiner
 from rayfix_service.fusion.report import Angle
 from rayfix_service.wire import MAX_REPORTS, FieldProblem, InvalidReportError
 from rayfix_service.wire.problems import Path, shown
-from rayfix_tables.angles import wrap
+from rayfix_tables.angles import wrap_one
 
 STDEV_DEG = 5.0
 """Anchors tell no uncertainty; this is taken for the standard deviation of their angles."""
@@ -106,7 +106,7 @@ def ublox_angle(event: UudfEvent, station_id: str, *, stdev_deg: float = STDEV_D
     stdev = math.radians(stdev_deg)
     return Angle(
         station_id=station_id,
-        azimuth=float(wrap(math.radians(-event.azimuth))),
+        azimuth=wrap_one(math.radians(-event.azimuth)),
         azimuth_stdev=stdev,
         zenith=math.radians(90 - event.elevation),
         zenith_stdev=stdev,

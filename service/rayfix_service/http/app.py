@@ -21,6 +21,7 @@ from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.feed_relay import FeedRelay
 from rayfix_service.http.keys import ApiKeys
+from rayfix_service.http.locating import Answerer
 from rayfix_service.http.metrics import Metrics, forget_dead_workers
 from rayfix_service.http.problems import Problem, install_problems
 from rayfix_service.http.rates import RateLimit
@@ -114,7 +115,10 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
 
         try:
             with on_stop_signal(stop):
-                async with open_hub(settings.hub, on_outcome=state.metrics.hub_told) as state.hub:
+                async with open_hub(settings.hub, on_outcome=state.metrics.hub_told) as hub:
+                    state.answerer = Answerer(
+                        metrics=state.metrics, feed=state.feed, slow_fixes=state.slow_fixes, hub=hub
+                    )
                     if settings.runtime_folder is not None:
                         forget_dead_workers()
                         await _take_turn(tables, settings.runtime_folder / "ready", stopping)
@@ -133,6 +137,8 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
         lifespan=lifespan,
         redoc_url=None,
         redirect_slashes=False,  # a redirected POST loses its body in many clients; a 404 is clear
+        # The figures are those of /metrics; and to ask at each request whether others are wanted takes long.
+        telemetry={"tracing": False, "metrics": False, "logs": False},
     )
     app.state.settings = settings
     app.state.per_table = PerTable()
@@ -153,7 +159,7 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
             expose_headers=["Retry-After", HEADER],
         )
     install_problems(app)
-    app.add_middleware(RequestContext, metrics=app.state.metrics)  # around all, to see the last resort's answers too
+    app.add_middleware(RequestContext, metrics=app.state.metrics)  # around all others
     app.include_router(routes_positions.router)
     app.include_router(routes_formats.router)
     app.include_router(routes_stream.router)

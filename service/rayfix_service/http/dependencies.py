@@ -8,8 +8,10 @@ from collections.abc import Awaitable, Callable
 from typing import Annotated
 
 from fastapi import Depends, Query, Request
-from starlette.requests import ClientDisconnect, HTTPConnection
+from starlette.requests import HTTPConnection
+from starlette.types import Receive, Scope
 
+from rayfix_service.http.headers import header
 from rayfix_service.http.problems import (
     BODY_TOO_LARGE,
     CONNECTION_ENDED,
@@ -50,33 +52,46 @@ def report_limit(connection: HTTPConnection) -> int:
 def body_reader(limit_of: Callable[[BodyLimits], int], *, text: bool = False) -> Callable[[Request], Awaitable[bytes]]:
     """Make the dependency that reads a body, JSON or plain text, within a limit."""
 
-    async def read_body(request: Request) -> bytes:
-        (_require_text if text else _require_json)(request.headers.get("content-type"))
+    async def read_dependency(request: Request) -> bytes:
         limit = limit_of(request.app.state.settings.body_limits)
-        announced = request.headers.get("content-length", "")
-        if announced.isdecimal() and int(announced) > limit:
+        return await read_body(request.scope, request.receive, limit, text=text)
+
+    return read_dependency
+
+
+async def read_body(scope: Scope, receive: Receive, limit: int, *, text: bool = False) -> bytes:
+    """Read the body of a request, JSON or plain text.
+
+    Raises
+    ------
+    ProblemError
+        When it is of another type or longer than ``limit`` bytes, or the connection ends within it.
+    """
+    (_require_text if text else _require_json)(header(scope, b"content-type"))
+    announced = header(scope, b"content-length")
+    if announced is not None and announced.isdecimal() and int(announced) > limit:
+        raise _too_large(limit)
+    chunks, length, more = [], 0, True
+    while more:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            raise ProblemError(CONNECTION_ENDED, "the connection ended within the body")
+        chunks.append(message.get("body", b""))
+        length += len(chunks[-1])
+        if length > limit:  # a chunked body announces nothing
             raise _too_large(limit)
-        body = bytearray()
-        try:
-            async for chunk in request.stream():  # a chunked body announces nothing
-                body += chunk
-                if len(body) > limit:
-                    raise _too_large(limit)
-        except ClientDisconnect:
-            raise ProblemError(CONNECTION_ENDED, "the connection ended within the body") from None
-        return bytes(body)
-
-    return read_body
+        more = message.get("more_body", False)
+    return chunks[0] if len(chunks) == 1 else b"".join(chunks)
 
 
-read_report_body = body_reader(lambda limits: limits.report)
-
-ReportBody = Annotated[bytes, Depends(read_report_body)]
+ReportBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.report))]
 BatchBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.batch))]
 LinesBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.report, text=True))]
 
 
 def _require_json(content_type: str | None) -> None:
+    if content_type == "application/json":  # as nearly all say
+        return
     media_type = _media_type(content_type)
     if media_type == "application/json" or (media_type.startswith("application/") and media_type.endswith("+json")):
         return

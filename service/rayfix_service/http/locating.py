@@ -15,7 +15,6 @@ from rayfix_service.adapters.adapted import Adapted, error_in_message
 from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.omlox_hub import OmloxHub
 from rayfix_service.fusion.report import Fix, Report
-from rayfix_service.http.dependencies import TableDep
 from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.metrics import Metrics
 from rayfix_service.http.problems import ProblemError, internal_problem, problem_document, report_problem
@@ -73,16 +72,15 @@ def foreign(adapted: Adapted) -> Incoming:
 
 @dataclass(frozen=True, kw_only=True)
 class Answerer:
-    """What answers reports: a table, the figures that it adds to, the feed and hub to tell, threads for slow ones."""
+    """What answers reports: the figures that it adds to, the feed and hub to tell, threads for slow ones."""
 
-    table: ServedTable
     metrics: Metrics
     feed: FixFeed
     slow_fixes: SlowFixes
     hub: OmloxHub | None
 
-    async def answer(self, incoming: Incoming, wanted: Wanted) -> dict[str, Any]:
-        """Locate a report and write the answer as wanted.
+    async def answer(self, table: ServedTable, incoming: Incoming, wanted: Wanted) -> dict[str, Any]:
+        """Locate a report with a table and write the answer as wanted.
 
         Raises
         ------
@@ -92,21 +90,23 @@ class Answerer:
             When the fix is slow and the service too busy.
         """
         try:
-            fix, track, seconds = await self._locate(incoming.report, wanted)
+            fix, track, seconds = await self._locate(table, incoming.report, wanted)
         except ReportError as error:
             if incoming.adapted is None:
                 raise
             raise error_in_message(error, incoming.adapted) from None
-        self.feed.publish(self.table.name, fix.target_id, partial(self._event, incoming, fix, track, seconds))
-        site = self.table.site
+        self.feed.publish(table.name, fix.target_id, partial(_event, table.name, incoming, fix, track, seconds))
+        site = table.site
         if self.hub is not None:
             self.hub.tell(fix, site, track)
         return write(fix, wanted.output, site, compute_seconds=seconds, adapted=incoming.adapted, track=track)
 
-    async def answer_or_problem(self, make: Callable[[], Incoming], wanted: Wanted) -> dict[str, Any]:
+    async def answer_or_problem(
+        self, table: ServedTable, make: Callable[[], Incoming], wanted: Wanted
+    ) -> dict[str, Any]:
         """Answer one report of several, with a problem where it cannot be used."""
         try:
-            return await self.answer(make(), wanted)
+            return await self.answer(table, make(), wanted)
         except ReportError as error:
             return report_problem(error)
         except ProblemError as error:
@@ -116,7 +116,9 @@ class Answerer:
             _log.exception("a report of several failed")
             return internal_problem()
 
-    async def _locate(self, report: Report, wanted: Wanted) -> tuple[Fix, TrackedPosition | None, float]:
+    async def _locate(
+        self, table: ServedTable, report: Report, wanted: Wanted
+    ) -> tuple[Fix, TrackedPosition | None, float]:
         """Locate a report; returns the fix, its target's track if that is wanted, and the time of the fix, s.
 
         A fix with an angle takes less than a millisecond or a few, right on the event loop. In the thread pool that
@@ -124,14 +126,14 @@ class Answerer:
         """
         start = perf_counter()
         if not wanted.follows(report):
-            fix = await self._wherever(self.table.locator.locate, report)
+            fix = await self._wherever(table.locator.locate, report)
             seconds = perf_counter() - start
             self.metrics.fix_done(fix, seconds)
             return fix, None, seconds
-        fused = await self._wherever(self.table.locator.fuse, report)
+        fused = await self._wherever(table.locator.fuse, report)
         seconds = perf_counter() - start
         self.metrics.fix_done(fused.fix, seconds)
-        track = self.table.tracker.follow(fused)
+        track = table.tracker.follow(fused)
         if track is not None:
             self.metrics.track_done(track.state)
         return fused.fix, track, seconds
@@ -140,20 +142,17 @@ class Answerer:
         """Locate on the event loop, or in a thread what would take too long there."""
         return await self.slow_fixes.locate(locate, report) if is_slow(report) else locate(report)
 
-    def _event(self, incoming: Incoming, fix: Fix, track: TrackedPosition | None, seconds: float) -> bytes:
-        return to_json(
-            {
-                "table": self.table.name,
-                "report": incoming.native_document(),
-                "fix": fix_to_document(fix, seconds, track),
-            }
-        )
+
+def _event(table: str, incoming: Incoming, fix: Fix, track: TrackedPosition | None, seconds: float) -> bytes:
+    """Write what the feed tells of a fix."""
+    document = {"table": table, "report": incoming.native_document(), "fix": fix_to_document(fix, seconds, track)}
+    return to_json(document)
 
 
-async def get_answerer(connection: HTTPConnection, table: TableDep) -> Answerer:
-    """Return what answers, or end the request."""
-    state = connection.app.state
-    return Answerer(table=table, metrics=state.metrics, feed=state.feed, slow_fixes=state.slow_fixes, hub=state.hub)
+async def get_answerer(connection: HTTPConnection) -> Answerer:
+    """Return what answers."""
+    answerer: Answerer = connection.app.state.answerer
+    return answerer
 
 
 AnswererDep = Annotated[Answerer, Depends(get_answerer)]

@@ -31,6 +31,7 @@ class Metrics:
             ("route", "method", "status"),
             registry=self._registry,
         )
+        self._by_request: dict[tuple[str, str, str], tuple[Counter, Histogram]] = {}
         self._request_seconds = Histogram(
             "rayfix_http_request_seconds",
             "Time from a request's head to the end of its answer",
@@ -85,8 +86,13 @@ class Metrics:
     def request_done(self, route: str, method: str, status: str, seconds: float) -> None:
         """Count a request."""
         method = method if method in _METHODS else "other"
-        self._requests.labels(route, method, status).inc()
-        self._request_seconds.labels(route, method).observe(seconds)
+        kind = (route, method, status)
+        if (figures := self._by_request.get(kind)) is None:  # to find them by their labels takes a lock for each
+            figures = self._requests.labels(*kind), self._request_seconds.labels(route, method)
+            self._by_request[kind] = figures
+        requests, request_seconds = figures
+        requests.inc()
+        request_seconds.observe(seconds)
 
     def fix_done(self, fix: Fix, seconds: float) -> None:
         """Count a fix and its measurements."""

@@ -1,6 +1,5 @@
 """Errors as RFC 9457 problem documents (``application/problem+json``)."""
 
-import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,14 +9,11 @@ from fastapi.exceptions import RequestValidationError, WebSocketRequestValidatio
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rayfix_service.wire import FieldProblem, MalformedJsonError, path_text, problems_of
 from rayfix_tables.errors import ReportError
 
 MEDIA_TYPE = "application/problem+json"
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,39 +175,10 @@ async def _answer_http(request: Request, error: Exception) -> JSONResponse:
     return problem_response(problem_document(kind, str(error.detail)), error.headers)
 
 
-class LastResort:
-    """Middleware that turns an exception nobody handled into a problem, and logs it once.
-
-    A handler for Exception would do so too, but Starlette raises the exception again after that, and the
-    server logs it a second time.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
-        started = False
-
-        async def send_noting(message: Message) -> None:
-            nonlocal started
-            started = started or message["type"] == "http.response.start"
-            await send(message)
-
-        try:
-            await self.app(scope, receive, send_noting)
-        except Exception:
-            if scope["type"] != "http" or started:
-                raise  # only the server can cut the connection, and it logs
-            _log.exception("request %s %s failed", scope["method"], scope["path"])
-            await problem_response(internal_problem())(scope, receive, send)
-
-
 def install_problems(app: FastAPI) -> None:
-    """Make every error of `app` a problem document."""
+    """Make every error that the routes of `app` raise a problem document."""
     app.add_exception_handler(ProblemError, _answer_error)
     app.add_exception_handler(ReportError, _answer_error)
     app.add_exception_handler(RequestValidationError, _answer_validation)
     app.add_exception_handler(WebSocketRequestValidationError, _answer_validation)  # before the handshake
     app.add_exception_handler(HTTPException, _answer_http)
-    app.add_middleware(LastResort)

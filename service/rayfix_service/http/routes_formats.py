@@ -12,7 +12,7 @@ from rayfix_service.adapters.nrppa_documents import NrppaDocument
 from rayfix_service.adapters.silabs import SilabsDocument, parse_silabs
 from rayfix_service.adapters.ublox import parse_ublox
 from rayfix_service.http.access import client_of
-from rayfix_service.http.dependencies import LinesBody, ReportBody
+from rayfix_service.http.dependencies import LinesBody, ReportBody, TableDep
 from rayfix_service.http.examples import NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.http.json_answer import JsonAnswer
 from rayfix_service.http.locating import AnswererDep, foreign
@@ -44,9 +44,9 @@ class LinesResult(BaseModel):
     responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(NrppaDocument, NRPPA_EXAMPLES),
 )
-async def post_nrppa(answerer: AnswererDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
+async def post_nrppa(answerer: AnswererDep, table: TableDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    return JsonAnswer(await answerer.answer(foreign(parse_nrppa(body)), wanted), media_type=wanted.media_type)
+    return JsonAnswer(await answerer.answer(table, foreign(parse_nrppa(body)), wanted), media_type=wanted.media_type)
 
 
 @router.post(
@@ -56,9 +56,9 @@ async def post_nrppa(answerer: AnswererDep, body: ReportBody, wanted: WantedDep)
     responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(SilabsDocument, SILABS_EXAMPLES),
 )
-async def post_silabs(answerer: AnswererDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
+async def post_silabs(answerer: AnswererDep, table: TableDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    return JsonAnswer(await answerer.answer(foreign(parse_silabs(body)), wanted), media_type=wanted.media_type)
+    return JsonAnswer(await answerer.answer(table, foreign(parse_silabs(body)), wanted), media_type=wanted.media_type)
 
 
 @router.post(
@@ -76,6 +76,7 @@ async def post_silabs(answerer: AnswererDep, body: ReportBody, wanted: WantedDep
 async def post_ublox(
     request: Request,
     answerer: AnswererDep,
+    table: TableDep,
     body: LinesBody,
     wanted: WantedDep,
     station: Annotated[list[str], Query(description="ANCHOR=STATION, for anchors whose id is no station's")] = [],  # noqa: B006
@@ -90,5 +91,5 @@ async def post_ublox(
     patience = Patience(request)
     for adapted in messages:
         await patience.take_a_breath()
-        results.append(await answerer.answer_or_problem(partial(foreign, with_height(adapted, known)), wanted))
+        results.append(await answerer.answer_or_problem(table, partial(foreign, with_height(adapted, known)), wanted))
     return JsonAnswer({"results": results})

@@ -5,16 +5,19 @@ from typing import Any
 
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
+from starlette.types import Receive, Scope
 
 from rayfix_service.http.access import client_of
-from rayfix_service.http.dependencies import BatchBody, ReportBody, get_table, read_report_body
+from rayfix_service.http.dependencies import BatchBody, ReportBody, TableDep, read_body
 from rayfix_service.http.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
 from rayfix_service.http.json_answer import JsonAnswer
-from rayfix_service.http.locating import AnswererDep, get_answerer, native
+from rayfix_service.http.locating import Answerer, AnswererDep, native
 from rayfix_service.http.outputs import NATIVE_ANSWER, POSITION_PROBLEMS, NativeOrOther, request_body
 from rayfix_service.http.patience import Patience
 from rayfix_service.http.problems import Problem
-from rayfix_service.http.wanted import WantedDep, get_wanted
+from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.http.tables import ServedTable
+from rayfix_service.http.wanted import Wanted, WantedDep, wanted_by
 from rayfix_service.wire import (
     MAX_REPORTS,
     BatchDocument,
@@ -44,15 +47,22 @@ router = APIRouter(prefix="/v1", tags=["positions"])
     responses={**NATIVE_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(ReportDocument, REPORT_EXAMPLES),
 )
-async def post_position(answerer: AnswererDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
+async def post_position(answerer: AnswererDep, table: TableDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
-    return JsonAnswer(await answerer.answer(native(body), wanted), media_type=wanted.media_type)
+    return await _answer(answerer, table, body, wanted)
 
 
-async def answer_position(request: Request) -> JsonAnswer:
+async def answer_position(scope: Scope, receive: Receive) -> JsonAnswer:
     """Answer a request without a query as :func:`post_position` does."""
-    answerer = await get_answerer(request, await get_table(request))
-    return await post_position(answerer, await read_report_body(request), await get_wanted(request))
+    state = scope["app"].state
+    settings: ServiceSettings = state.settings
+    table = state.tables.named(None)
+    body = await read_body(scope, receive, settings.body_limits.report)
+    return await _answer(state.answerer, table, body, wanted_by(scope, settings))
+
+
+async def _answer(answerer: Answerer, table: ServedTable, body: bytes, wanted: Wanted) -> JsonAnswer:
+    return JsonAnswer(await answerer.answer(table, native(body), wanted), media_type=wanted.media_type)
 
 
 @router.post(
@@ -62,7 +72,9 @@ async def answer_position(request: Request) -> JsonAnswer:
     responses=POSITION_PROBLEMS,
     openapi_extra=request_body(BatchDocument, BATCH_EXAMPLES),
 )
-async def post_batch(request: Request, answerer: AnswererDep, body: BatchBody, wanted: WantedDep) -> JsonAnswer:
+async def post_batch(
+    request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, wanted: WantedDep
+) -> JsonAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
     documents = _batch_reports(read_json(body))
     if (limit := request.app.state.rate_limit) is not None:
@@ -71,7 +83,7 @@ async def post_batch(request: Request, answerer: AnswererDep, body: BatchBody, w
     patience = Patience(request)
     for document in documents:
         await patience.take_a_breath()
-        results.append(await answerer.answer_or_problem(partial(native, document), wanted))
+        results.append(await answerer.answer_or_problem(table, partial(native, document), wanted))
     return JsonAnswer({"results": results})
 
 

@@ -13,7 +13,7 @@ from pydantic_core import to_json
 from starlette.websockets import WebSocketDisconnect
 
 from rayfix_service.http.access import client_of
-from rayfix_service.http.dependencies import TablesDep, report_limit
+from rayfix_service.http.dependencies import TableDep, TablesDep, report_limit
 from rayfix_service.http.examples import FIX_EVENT_EXAMPLE
 from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.feed_relay import FeedRelay
@@ -112,7 +112,7 @@ async def _events(
 
 
 @router.websocket("/stream")
-async def stream(websocket: WebSocket, answerer: AnswererDep, wanted: WantedDep) -> None:
+async def stream(websocket: WebSocket, answerer: AnswererDep, table: TableDep, wanted: WantedDep) -> None:
     """Answer each message, a report, with a fix or a problem, in their order.
 
     The next message is read when the last answer is on its way, so that a client that sends faster than it is
@@ -134,7 +134,7 @@ async def stream(websocket: WebSocket, answerer: AnswererDep, wanted: WantedDep)
                     BODY_TOO_LARGE, f"the message is longer than {limit} bytes; send fewer measurements at once"
                 )
             else:
-                answer = await answerer.answer_or_problem(partial(native, body), wanted)
+                answer = await answerer.answer_or_problem(table, partial(native, body), wanted)
             await websocket.send_text(to_json(answer, inf_nan_mode="null").decode())
             await asyncio.sleep(0)  # whatever else is on the loop comes in between
     except WebSocketDisconnect:

@@ -2,7 +2,6 @@
 
 from collections.abc import Awaitable, Callable
 
-from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -22,10 +21,10 @@ class ShortWay:
         Answers everything else.
     path : str
     answer : callable
-        Gets the request; may raise what the routes may.
+        Gets the request's scope and what receives its body; may raise what the routes may.
     """
 
-    def __init__(self, app: ASGIApp, path: str, answer: Callable[[Request], Awaitable[Response]]) -> None:
+    def __init__(self, app: ASGIApp, path: str, answer: Callable[[Scope, Receive], Awaitable[Response]]) -> None:
         self._app = app
         self.path = path
         self._answer = answer
@@ -37,7 +36,7 @@ class ShortWay:
             return
         scope["route"] = self  # its path is the label of the figures
         try:
-            response = await self._answer(Request(scope, receive))
+            response = await self._answer(scope, receive)
         except (ProblemError, ReportError) as error:
             response = error_response(error)
         await response(scope, receive, send)

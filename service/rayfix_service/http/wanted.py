@@ -1,13 +1,16 @@
 """What a request wants of its answers: their format, by query or Accept header, and whether targets are followed."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated
 
 from fastapi import Depends, Query
 from starlette.requests import HTTPConnection
+from starlette.types import Scope
 
 from rayfix_service.adapters.formats import OutputFormat
 from rayfix_service.fusion.report import Report
+from rayfix_service.http.headers import header
 from rayfix_service.http.settings import ServiceSettings
 
 JSON = "application/json"
@@ -63,19 +66,25 @@ Track = Annotated[
 
 async def get_wanted(connection: HTTPConnection, output: Output = None, track: Track = None) -> Wanted:
     """Read what a request wants."""
-    settings: ServiceSettings = connection.app.state.settings
-    media_type = JSON
-    if output is None:
-        media_type, output = _accepted(connection.headers.get("accept"))
-    return Wanted(
-        output=output,
-        media_type=media_type,
-        track=settings.track if track is None else track,
-        must_track=bool(track),
-    )
+    return wanted_by(connection.scope, connection.app.state.settings, output, track)
 
 
 WantedDep = Annotated[Wanted, Depends(get_wanted)]
+
+
+def wanted_by(
+    scope: Scope, settings: ServiceSettings, output: OutputFormat | None = None, track: bool | None = None
+) -> Wanted:
+    """Return what a request wants by its query, else by its Accept header and the service's settings."""
+    media_type = JSON
+    if output is None:
+        media_type, output = _accepted(header(scope, b"accept"))
+    return _wanted(output, media_type, settings.track if track is None else track, bool(track))
+
+
+@cache
+def _wanted(output: OutputFormat, media_type: str, track: bool, must_track: bool) -> Wanted:
+    return Wanted(output=output, media_type=media_type, track=track, must_track=must_track)
 
 
 def _accepted(accept: str | None) -> tuple[str, OutputFormat]:

@@ -43,7 +43,7 @@ from rayfix_service.wire.fields import (
     ZenithDeg,
     misfit,
 )
-from rayfix_tables.angles import wrap
+from rayfix_tables.angles import wrap_one
 
 
 class _WithErrorModel(WireModel):
@@ -57,9 +57,10 @@ class _WithErrorModel(WireModel):
 
     @model_validator(mode="after")
     def _tails_of_heavy_tails(self) -> Self:
-        for name in ("tail_share", "tail_scale"):
-            if getattr(self, name) is not None and self.error_model == "gaussian":
-                raise misfit(name, 'is of a heavy-tailed error; give "error_model": "heavy_tailed" or leave it out')
+        if self.error_model == "gaussian":
+            for name in ("tail_share", "tail_scale"):
+                if getattr(self, name) is not None:
+                    raise misfit(name, 'is of a heavy-tailed error; give "error_model": "heavy_tailed" or leave it out')
         return self
 
     def _error_model(self) -> ErrorModel:
@@ -110,7 +111,7 @@ class AngleDocument(_WithErrorModel):
         zenith, zenith_stdev = self.zenith_deg, self.zenith_stdev_deg
         return Angle(
             station_id=self.station_id,
-            azimuth=float(wrap(math.radians(self.azimuth_deg))),
+            azimuth=wrap_one(math.radians(self.azimuth_deg)),
             azimuth_stdev=math.radians(self.azimuth_stdev_deg),
             zenith=None if zenith is None else math.radians(zenith),
             zenith_stdev=None if zenith_stdev is None else math.radians(zenith_stdev),
@@ -121,37 +122,42 @@ class AngleDocument(_WithErrorModel):
 
 
 _Form = tuple[str, ...]
-"""Keys that one way of writing a measurement needs, the deviation last."""
+"""Keys that one way of writing a measurement needs, the deviation last, in the order of the document's fields."""
 
-_RANGE_FORMS: tuple[_Form, ...] = (
+
+class _Forms:
+    """The ways of writing a measurement."""
+
+    def __init__(self, *forms: _Form) -> None:
+        self._forms = frozenset(forms)
+        self._keys = tuple(dict.fromkeys(key for form in forms for key in form if not key.startswith("stdev")))
+        self._keys += tuple(dict.fromkeys(form[-1] for form in forms))
+        self._ways = " or ".join(f"{', '.join(form[:-1])} with {form[-1]}" for form in forms)
+        self.schema: dict[str, Any] = {"oneOf": [{"required": list(form)} for form in forms]}
+
+    def values(self, document: WireModel) -> tuple[_Form, list[float]]:
+        """Form that a document has, and its values."""
+        fields = vars(document)
+        form = tuple([key for key in self._keys if fields[key] is not None])
+        if form in self._forms:
+            return form, [fields[key] for key in form]
+        found = ", ".join(key for key in fields if key in form) or "neither length nor time"
+        raise misfit(None, f"has {found}; give either {self._ways}, not both")
+
+
+_RANGE_FORMS = _Forms(
     ("range_m", "stdev_m"),
     ("delay_ns", "stdev_ns"),
     ("toa_ns", "tod_ns", "stdev_ns"),
     ("round_trip_ns", "reply_ns", "stdev_ns"),
 )
-_ARRIVAL_FORMS: tuple[_Form, ...] = (("range_m", "stdev_m"), ("delay_ns", "stdev_ns"))
-_DIFFERENCE_FORMS: tuple[_Form, ...] = (("range_difference_m", "stdev_m"), ("delay_difference_ns", "stdev_ns"))
+_ARRIVAL_FORMS = _Forms(("range_m", "stdev_m"), ("delay_ns", "stdev_ns"))
+_DIFFERENCE_FORMS = _Forms(("range_difference_m", "stdev_m"), ("delay_difference_ns", "stdev_ns"))
 
 
-def _one_of(forms: tuple[_Form, ...]) -> dict[str, Any]:
-    """JSON schema of "the keys of one of these"."""
-    return {"oneOf": [{"required": list(form)} for form in forms]}
-
-
-def _values(document: WireModel, forms: tuple[_Form, ...]) -> tuple[_Form, list[float]]:
-    """Form that a document has, and its values."""
-    given = {key for form in forms for key in form if getattr(document, key) is not None}
-    for form in forms:
-        if given == set(form):
-            return form, [getattr(document, key) for key in form]
-    ways = " or ".join(f"{', '.join(form[:-1])} with {form[-1]}" for form in forms)
-    found = ", ".join(key for key in type(document).model_fields if key in given) or "neither length nor time"
-    raise misfit(None, f"has {found}; give either {ways}, not both")
-
-
-def _length(document: WireModel, forms: tuple[_Form, ...]) -> tuple[float, float]:
+def _length(document: WireModel, forms: _Forms) -> tuple[float, float]:
     """Length and its standard deviation, m."""
-    form, values = _values(document, forms)
+    form, values = forms.values(document)
     stdev = values.pop() * (1.0 if form[-1] == "stdev_m" else METRES_PER_NANOSECOND)
     if form[-1] == "stdev_m":
         return values[0], stdev
@@ -163,7 +169,7 @@ def _length(document: WireModel, forms: tuple[_Form, ...]) -> tuple[float, float
 class RangeDocument(_WithErrorModel):
     """A propagation time: a path length, a delay, arrival and departure, or a round trip and the time of the reply."""
 
-    model_config = ConfigDict(title="PropagationTime", json_schema_extra=_one_of(_RANGE_FORMS))
+    model_config = ConfigDict(title="PropagationTime", json_schema_extra=_RANGE_FORMS.schema)
 
     type: Literal["pt"]
     station_id: StationId
@@ -196,7 +202,7 @@ _LONGEST = 1e6
 class TimeOfArrivalDocument(_WithErrorModel):
     """A time of arrival, with an unknown clock offset that all of a report's times of arrival share."""
 
-    model_config = ConfigDict(title="TimeOfArrival", json_schema_extra=_one_of(_ARRIVAL_FORMS))
+    model_config = ConfigDict(title="TimeOfArrival", json_schema_extra=_ARRIVAL_FORMS.schema)
 
     type: Literal["toa"]
     station_id: StationId
@@ -207,7 +213,7 @@ class TimeOfArrivalDocument(_WithErrorModel):
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:
-        _values(self, _ARRIVAL_FORMS)
+        _ARRIVAL_FORMS.values(self)
         return self
 
     def measurement(self) -> TimeOfArrival:
@@ -221,7 +227,7 @@ class TimeOfArrivalDocument(_WithErrorModel):
 class TimeDifferenceDocument(_WithErrorModel):
     """A time difference of arrival, t(station) - t(reference station)."""
 
-    model_config = ConfigDict(title="TimeDifferenceOfArrival", json_schema_extra=_one_of(_DIFFERENCE_FORMS))
+    model_config = ConfigDict(title="TimeDifferenceOfArrival", json_schema_extra=_DIFFERENCE_FORMS.schema)
 
     type: Literal["tdoa"]
     station_id: StationId
@@ -238,7 +244,7 @@ class TimeDifferenceDocument(_WithErrorModel):
                 "reference_station_id",
                 f"is {self.reference_station_id!r}, the station itself; name the other one of the difference",
             )
-        _values(self, _DIFFERENCE_FORMS)
+        _DIFFERENCE_FORMS.values(self)
         return self
 
     def measurement(self) -> TimeDifference:
