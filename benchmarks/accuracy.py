@@ -3,15 +3,13 @@
 Run with ``make accuracy``, or with ``--table`` on any table.
 """
 
-import argparse
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 
 from rayfix.evaluation.accuracy import drop_uniformly, locate_drops
 from rayfix.evaluation.simulate import Noise, Timing
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 from rayfix_service.fusion.locator import Locator
 from rayfix_tables.table import Table
 
@@ -28,10 +26,8 @@ CASES: list[tuple[float, Timing]] = [
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser = table_parser(__doc__)
     parser.add_argument("--drops", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=2026)
     options = parser.parse_args()
     with open_or_build(options.table) as table:
         measure(table, options.drops, options.seed)

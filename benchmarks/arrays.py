@@ -3,7 +3,6 @@
 Run with ``--table`` on any table, of which the scene and the stations count; the bundled hall's is built when left out.
 """
 
-import argparse
 import json
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from rayfix.evaluation.accuracy import drop_uniformly
 from rayfix.evaluation.arrays.picture import draw_angle_errors
 from rayfix.evaluation.arrays.planar import PlanarArray, Signal
 from rayfix.evaluation.arrays.study import ArrayStudy, angle_errors, statistics_rows, study_statistics
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 
 STUDIES = {
     "4 x 4 antennas, 20 dB": ArrayStudy(
@@ -32,10 +31,8 @@ STUDIES = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser = table_parser(__doc__)
     parser.add_argument("--drops", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--picture", type=Path, help="where to draw the errors")
     parser.add_argument("--json", type=Path, help="where to write the statistics")
     options = parser.parse_args()

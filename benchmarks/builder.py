@@ -28,7 +28,7 @@ from rayfix_offline.cells import assemble_level, fit_cells, widen_cells
 from rayfix_offline.em import ExpectationMaximisation, fit_em
 from rayfix_offline.engine import RayEngine
 from rayfix_offline.launch import Segments, launch
-from rayfix_offline.moments import gather_groups, new_rows
+from rayfix_offline.moments import gather_groups, gathered_arrays, new_rows
 from rayfix_offline.pathprior import fill_path_prior
 from rayfix_offline.pieces import cut_pieces
 from rayfix_offline.rays import RaySet, sample_rays
@@ -193,30 +193,10 @@ def scattered_blocks(num_cells: int, most: int, rng: np.random.Generator) -> NDA
 
 def gather_cells(centres: NDArray[np.float64], level: LevelRays) -> None:
     """Gather the groups of cells, and no more."""
-    rays, pieces, sequences = level.rays, level.pieces, level.sequences
-    num_slices, rows = pieces.num_slices, new_rows(len(sequences.images))
+    arrays = gathered_arrays(level.rays, level.pieces, level.sequences)
+    num_slices, rows = level.pieces.num_slices, new_rows(len(level.sequences.images))
     for centre in centres:
-        gather_groups(
-            centre[0],
-            centre[1],
-            level.window,
-            rays.grid.ring_offsets,
-            rays.grid.ring_cells,
-            rays.azimuth,
-            rays.zenith,
-            rays.solid_angle,
-            rays.directions,
-            pieces.offsets,
-            pieces.sequence,
-            pieces.slice,
-            pieces.mass,
-            pieces.mean,
-            pieces.variance,
-            sequences.images,
-            sequences.mirrors,
-            num_slices,
-            rows,
-        )
+        gather_groups(*centre, level.window, *arrays, num_slices, rows)
 
 
 def print_stages(seconds: dict[str, float]) -> None:

@@ -4,9 +4,7 @@ The reported figures are those of the default seed. Settings of the fusion must 
 (``--seed 1``, say) for that, so that what is reported is a test.
 """
 
-import argparse
 from collections import Counter
-from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -14,7 +12,7 @@ import numpy as np
 from rayfix.evaluation.accuracy import Drop, drop_uniformly, locate_drop
 from rayfix.evaluation.calibration import calibrate, wilson_interval
 from rayfix.evaluation.simulate import Noise, Rule, Timing
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 from rayfix_service.fusion.locator import Locator
 
 TIMINGS: tuple[Timing, ...] = ("none", "pt", "tdoa")
@@ -24,10 +22,8 @@ PROBABILITIES = (0.5, 0.68, 0.9, 0.99)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser = table_parser(__doc__)
     parser.add_argument("--drops", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--select", choices=get_args(Rule), default="strongest", help="path that a station reports")
     options = parser.parse_args()
     with open_or_build(options.table) as table:

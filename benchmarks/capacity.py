@@ -4,7 +4,6 @@ A real ``rayfix serve`` of one worker answers reports of uniform drops; its proc
 clock, so that the figures hold on a machine that is busy with other work too. Run with ``--table`` on any table.
 """
 
-import argparse
 import http.client
 import json
 import socket
@@ -22,7 +21,7 @@ import psutil
 
 from rayfix.evaluation.accuracy import Drop, drop_uniformly
 from rayfix.evaluation.simulate import Noise, Timing, simulate_report
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.wire import parse_report
 
@@ -39,10 +38,8 @@ BATCH = 100
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser = table_parser(__doc__)
     parser.add_argument("--reports", type=int, default=200, help="of each kind")
-    parser.add_argument("--seed", type=int, default=2026)
     options = parser.parse_args()
     with open_or_build(options.table) as table:
         drops = drop_uniformly(table, options.reports, np.random.default_rng([options.seed, 0]))

@@ -5,10 +5,8 @@ products, tens of thousands a report, can be formed, and are, by plain NumPy. Th
 keeps of the same factors. Told is what that changes: the report's evidence, and the posterior's mean and width.
 """
 
-import argparse
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from rayfix.evaluation.accuracy import Drop, drop_uniformly
 from rayfix.evaluation.simulate import Noise, Timing, simulate_report
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 from rayfix_service.fusion import reference
 from rayfix_service.fusion.beam import multiply
 from rayfix_service.fusion.factors import Factor, make_factor
@@ -38,11 +36,9 @@ DEFAULT = FusionSettings()
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser = table_parser(__doc__)
     parser.add_argument("--reports", type=int, default=1000, help="of all kinds together")
     parser.add_argument("--products", type=int, default=30_000, help="most of a report")
-    parser.add_argument("--seed", type=int, default=2026)
     options = parser.parse_args()
     with open_or_build(options.table) as table, threadpool_limits(limits=1):
         count = math.ceil(options.reports / len(KINDS))

@@ -6,9 +6,7 @@ gets the first few of them only, and errors are those of these few for both. Tim
 machine is that of the clock. Fixes per second are by the clock, of all reports in one call on one and on two threads.
 """
 
-import argparse
 from collections.abc import Callable
-from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
 
@@ -19,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from rayfix.evaluation.accuracy import Drop, drop_uniformly
 from rayfix.evaluation.paper.locate import PaperLocator
 from rayfix.evaluation.simulate import Noise, Timing, simulate_report
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import Report
 from rayfix_service.wire import parse_report
@@ -38,11 +36,9 @@ DEGREES, RANGE_STDEV = 1.0, 0.5
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser = table_parser(__doc__)
     parser.add_argument("--reports", type=int, default=200, help="of each kind")
     parser.add_argument("--paper-reports", type=int, default=20, help="of each kind, for the paper's method")
-    parser.add_argument("--seed", type=int, default=2026)
     options = parser.parse_args()
     with open_or_build(options.table) as table, threadpool_limits(limits=1):
         drops = heard_by_all(table, options.reports, options.seed)

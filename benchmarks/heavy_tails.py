@@ -6,10 +6,8 @@ Gaussian, as heavy-tailed, or as Gaussian of the whole error's standard deviatio
 milliseconds; ``share`` is how much of the truth's error is within the stated 68 % ellipsoid.
 """
 
-import argparse
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 
 from rayfix.evaluation.accuracy import Drop, drop_positions, drops_at, solver_of
 from rayfix.evaluation.simulate import fold_direction, select_path
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import GAUSSIAN, HEAVY_TAILED, Angle, ErrorModel, Measurement, Range, Report
 
@@ -66,10 +64,8 @@ def report_of(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser = table_parser(__doc__)
     parser.add_argument("--drops", type=int, default=150)
-    parser.add_argument("--seed", type=int, default=2026)
     options = parser.parse_args()
     whole = float(np.sqrt(1.0 + HEAVY_TAILED.tail_share * (HEAVY_TAILED.tail_scale**2 - 1.0)))
     stated = {"gaussian": (GAUSSIAN, 1.0), "heavy": (HEAVY_TAILED, 1.0), "widened": (GAUSSIAN, whole)}

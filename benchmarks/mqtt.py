@@ -5,7 +5,6 @@ when the service takes a packet's first angle to when its position is back here.
 hear waits for the window, which is told apart.
 """
 
-import argparse
 import asyncio
 import json
 import shutil
@@ -25,7 +24,7 @@ import numpy as np
 
 from rayfix.evaluation.accuracy import drops_at, solver_of
 from rayfix.evaluation.simulate import select_path
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 from rayfix.evaluation.walks import walk
 from rayfix_tables.table import Table
 
@@ -33,13 +32,11 @@ STDEV_DEG = 2.0
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser = table_parser(__doc__, seed=1)
     parser.add_argument("--tags", type=int, default=1)
     parser.add_argument("--rate", type=float, default=40.0, help="packets a second of each tag")
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--track", action="store_true")
-    parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     program = shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin:/usr/bin")
     if program is None:

@@ -17,11 +17,9 @@ from numpy.typing import NDArray
 
 from rayfix.evaluation.forward import ForwardSolver
 from rayfix.example.files import write_example
-from rayfix_offline.launch import Segments, launch
 from rayfix_offline.pathprior import PathPrior, fill_path_prior, reflection_factors
-from rayfix_offline.rays import RaySet, sample_rays
 from rayfix_offline.site import SiteFile, read_site
-from rayfix_offline.trace import reflectivity_of
+from rayfix_offline.trace import launch_rays
 from rayfix_offline.twin import Twin, prepare_twin
 
 SPACINGS_DEG = (0.21, 0.42, 0.83, 1.67)
@@ -69,25 +67,11 @@ def main() -> None:
     plot(results, options.output)
 
 
-def launch_rays(site: SiteFile, twin: Twin, spacing: float, seed: int) -> tuple[RaySet, Segments]:
-    """Launch the first station's rays."""
-    rays = sample_rays(spacing, np.random.default_rng(seed))
-    segments = launch(
-        np.array(site.stations[0].position_m),
-        rays.directions,
-        engine=twin.engine,
-        planes=twin.planes,
-        reflectivity=reflectivity_of(site, twin),
-        bounds=twin.scene.bounds,
-        max_reflections=site.propagation.max_reflections,
-        max_path_length=site.propagation.max_path_length_m,
-    )
-    return rays, segments
-
-
 def draw_places(site: SiteFile, twin: Twin, count: int, rng: np.random.Generator) -> Places:
     """Draw places on rays, in proportion to s^2, and find all paths to them."""
-    rays, segments = launch_rays(site, twin, np.deg2rad(1.0), int(rng.integers(2**31)))
+    rays, segments = launch_rays(
+        site.stations[0], site, twin, np.deg2rad(1.0), np.random.default_rng(int(rng.integers(2**31)))
+    )
     exponent = site.propagation.path_prior_exponent
     solver = ForwardSolver.from_mesh(
         twin.scene.vertices,
@@ -126,7 +110,7 @@ def study(name: str, site: SiteFile, twin: Twin, count: int, seed: int) -> NDArr
     print("  rays [deg]  voxel [m]   error of ln(total): median  |.| 90 %   no ray   weight put wrong")
     found = np.zeros((len(SPACINGS_DEG), len(REFINEMENTS), 3))
     for i, degrees in enumerate(SPACINGS_DEG):
-        rays, segments = launch_rays(site, twin, np.deg2rad(degrees), seed + 1)
+        rays, segments = launch_rays(site.stations[0], site, twin, np.deg2rad(degrees), np.random.default_rng(seed + 1))
         for j, refinement in enumerate(REFINEMENTS):
             prior = fill_path_prior(
                 rays,

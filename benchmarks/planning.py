@@ -3,9 +3,6 @@
 Run with ``--table`` on any table; the bundled hall's is built when left out.
 """
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
@@ -14,7 +11,7 @@ from rayfix.evaluation.accuracy import drops_at, locate_drops, solver_of
 from rayfix.evaluation.planning.forecast import PlanMap, PlanSettings, draw_places, forecast
 from rayfix.evaluation.planning.heard import heard_paths
 from rayfix.evaluation.simulate import Noise, Timing
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 from rayfix_service.fusion.locator import Locator
 from rayfix_tables.angles import direction
 from rayfix_tables.table import Table
@@ -31,12 +28,10 @@ CASES: list[tuple[float, Timing]] = [
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser = table_parser(__doc__)
     parser.add_argument("--height", type=float, default=1.2)
     parser.add_argument("--spacing", type=float, default=1.0, help="side of the squares, m")
     parser.add_argument("--draws", type=int, default=16, help="reports from each square, forecast and measured")
-    parser.add_argument("--seed", type=int, default=2026)
     options = parser.parse_args()
     with open_or_build(options.table) as table:
         compare_paths(table, options.height, options.spacing, options.seed)

@@ -8,10 +8,8 @@
    simulated in the changed building, the table is that of the nominal one.
 """
 
-import argparse
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +24,7 @@ from rayfix.evaluation.stress import (
     with_scaled_stdevs,
     with_turned_stations,
 )
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import Fix
 from rayfix_service.wire import parse_report
@@ -43,10 +41,8 @@ MARGIN = 0.12  # m; moved objects must not bury a drop
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser = table_parser(__doc__)
     parser.add_argument("--drops", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=2026)
     options = parser.parse_args()
     with open_or_build(options.table) as table:
         stations = table.site.stations

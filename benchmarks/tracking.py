@@ -3,8 +3,6 @@
 The reported figures are those of the default seed. Settings of the tracking must not be chosen by it: use another.
 """
 
-import argparse
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -12,7 +10,7 @@ from scipy.stats import chi2
 
 from rayfix.evaluation.accuracy import drops_at, solver_of
 from rayfix.evaluation.simulate import Noise, Timing
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 from rayfix.evaluation.walks import Errors, follow_walks, walk
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.tracking.motion import MotionModel
@@ -24,13 +22,11 @@ COLUMNS = "stations  angles  times             RMS      50 %     90 %     1 m   
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser = table_parser(__doc__)
     parser.add_argument("--walks", type=int, default=24)
     parser.add_argument("--reports", type=int, default=60, help="of each walk")
     parser.add_argument("--interval", type=float, default=0.5, help="seconds between reports")
     parser.add_argument("--speed", type=float, default=1.0, help="metres a second")
-    parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--particles", type=int, default=TrackingSettings().num_particles)
     parser.add_argument("--acceleration-density", type=float, default=MotionModel().acceleration_density)
     options = parser.parse_args()

@@ -6,7 +6,6 @@ Held-out points are judged as measured, with the least noise for which the windo
 discusses the results.
 """
 
-import argparse
 import tempfile
 import time
 from collections.abc import Mapping
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from rayfix.evaluation.accuracy import Drop, drop_uniformly, locate_drops
 from rayfix.evaluation.simulate import Noise
-from rayfix.evaluation.tables import open_or_build
+from rayfix.evaluation.tables import open_or_build, table_parser
 from rayfix.example.files import write_example
 from rayfix_offline.coarse import CoarseFit, sum_cells
 from rayfix_offline.em import ExpectationMaximisation, fit_em, sample_points
@@ -79,11 +78,9 @@ class Fitted:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", type=Path, help="a table of the bundled hall; built when left out")
+    parser = table_parser(__doc__, seed=40961)
     parser.add_argument("--cells", type=int, default=12, help="cells of a station and window to judge (default 12)")
     parser.add_argument("--drops", type=int, default=120)
-    parser.add_argument("--seed", type=int, default=40961)
     parser.add_argument("--output", type=Path, default=Path("fit-study"), metavar="DIR")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)

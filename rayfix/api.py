@@ -16,7 +16,6 @@ with needs_extra("service"):
     from rayfix_service.impulse_response import range_from_impulse_response
     from rayfix_service.ranging import range_from_round_trip, range_from_rssi, range_from_times
     from rayfix_service.tracking.settings import TrackingSettings
-    from rayfix_service.tracking.tracker import TrackedPosition
     from rayfix_service.tracking.tracker import Tracker as _Tracker
     from rayfix_service.wire import parse_report
 
@@ -114,12 +113,7 @@ class Locator(_Locator):
         Parameters
         ----------
         report : Report or mapping
-            A mapping has the form of the JSON that ``POST /v1/positions`` takes.
-
-        Raises
-        ------
-        ReportError
-            When the report cannot be used; its ``path`` names the field.
+            As of :meth:`locate`, and so are the errors.
         """
         return super().posterior(report if isinstance(report, Report) else parse_report(report))
 
@@ -129,12 +123,7 @@ class Locator(_Locator):
         Parameters
         ----------
         report : Report or mapping
-            A mapping has the form of the JSON that ``POST /v1/positions`` takes.
-
-        Raises
-        ------
-        ReportError
-            When the report cannot be used; its ``path`` names the field.
+            As of :meth:`locate`, and so are the errors.
         """
         return super().fuse(report if isinstance(report, Report) else parse_report(report))
 
@@ -151,18 +140,3 @@ class Tracker(_Tracker):
 
     def __init__(self, table: Table, settings: TrackingSettings | None = None) -> None:
         super().__init__(table.scene, settings)
-
-    def follow(self, fused: Fused) -> TrackedPosition | None:
-        """Take what :meth:`Locator.fuse` made of a report into its target's track.
-
-        Returns
-        -------
-        TrackedPosition or None
-            None as long as no report has said anything of the position.
-
-        Raises
-        ------
-        ReportError
-            When the report names no target or no time.
-        """
-        return super().follow(fused)

@@ -48,12 +48,8 @@ class SceneFigure:
 
         Parameters
         ----------
-        path : str or Path
-            Its suffix says the type: .png, .svg or .pdf.
-        document : mapping
-            Answer of the HTTP interface.
-        truth : array_like of shape (3,), optional
-            True position, m.
+        path, document, truth
+            As of :func:`plot_fix`.
         handles : sequence of Artist
             Of the legend, before those of labelled drawings.
         """

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rayfix_offline.former import read_former
+from rayfix_offline.holes import LOST_RAYS_WARNING
 from rayfix_offline.plan import StationPlan, plan_build
 from rayfix_offline.shards import ShardStore
 from rayfix_offline.site import SiteFile, read_site
@@ -26,9 +27,6 @@ from rayfix_tables.write import SceneContent, StationContent, check_writable, wr
 
 if TYPE_CHECKING:
     from rayfix_offline.cluster import Cluster
-
-LOST_RAYS_WARNING = 0.01
-"""In a closed scene, more lost rays than this share mean that it has holes."""
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, the cells that are done and the cells that there are in all (0 while not yet known)."""

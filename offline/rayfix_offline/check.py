@@ -5,12 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from rayfix_offline.findings import Finding
-from rayfix_offline.holes import Escapes, find_escapes
+from rayfix_offline.holes import LOST_RAYS_WARNING, Escapes, find_escapes
 from rayfix_offline.site import read_site
 from rayfix_offline.twin import Twin, prepare_twin
-
-LOST_RAYS_WARNING = 0.01
-"""More lost rays than this share mean that a scene has holes."""
 
 NOTABLE_SHARE = 0.05
 """A place that at least this share of the escaping rays pass is named."""

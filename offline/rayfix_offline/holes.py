@@ -11,6 +11,9 @@ from rayfix_offline.rays import sample_rays
 from rayfix_offline.site import StationSection
 from rayfix_offline.twin import Twin
 
+LOST_RAYS_WARNING = 0.01
+"""More lost rays than this share mean that a scene has holes."""
+
 RAY_SPACING = 0.03
 """Of the rays of the check, rad: 14,000 rays for each station."""
 

@@ -10,6 +10,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_offline.launch import Sequences
+from rayfix_offline.pieces import Pieces
+from rayfix_offline.rays import RaySet
+
 SIZE = 6
 """Length of the joint vector."""
 
@@ -37,6 +41,26 @@ def ring_span(azimuth: Any, reach: Any, cells: Any) -> Any:
     if 2.0 * half + 2.0 >= cells:
         return 0, cells
     return int(np.floor(middle - half)), int(np.floor(middle + half)) + 1
+
+
+def gathered_arrays(rays: RaySet, pieces: Pieces, sequences: Sequences) -> tuple[NDArray[Any], ...]:
+    """Return what cells gather, in the order in which :func:`gather_groups` takes it, from ``ring_offsets`` on."""
+    return (
+        rays.grid.ring_offsets,
+        rays.grid.ring_cells,
+        rays.azimuth,
+        rays.zenith,
+        rays.solid_angle,
+        rays.directions,
+        pieces.offsets,
+        pieces.sequence,
+        pieces.slice,
+        pieces.mass,
+        pieces.mean,
+        pieces.variance,
+        sequences.images,
+        sequences.mirrors,
+    )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

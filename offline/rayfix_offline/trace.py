@@ -117,11 +117,11 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin, *, jobs: 
     window = float(np.deg2rad(site.table.windows_deg[0]))
     spacing = window / RAYS_PER_WINDOW
     name = int.from_bytes(hashlib.sha256(station.id.encode()).digest()[:8], "big")
-    rays, segments = _launch(station, site, twin, spacing, np.random.default_rng([site.table.seed, name]))
+    rays, segments = launch_rays(station, site, twin, spacing, np.random.default_rng([site.table.seed, name]))
     prior_rays, prior_segments = rays, segments
     if spacing > prior_spacing(twin):
         rng = np.random.default_rng([site.table.seed, name, 1])
-        prior_rays, prior_segments = _launch(station, site, twin, prior_spacing(twin), rng)
+        prior_rays, prior_segments = launch_rays(station, site, twin, prior_spacing(twin), rng)
     exponent = site.propagation.path_prior_exponent
     prior = fill_path_prior(
         prior_rays, prior_segments, twin.free_space, exponent=exponent, refinement=PRIOR_REFINEMENT, jobs=jobs
@@ -147,10 +147,16 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin, *, jobs: 
     return StationTrace(finest=finest, lost_ray_share=prior_segments.lost_ray_share, coverage=prior.coverage)
 
 
-def _launch(
+def launch_rays(
     station: StationSection, site: SiteFile, twin: Twin, spacing: float, rng: np.random.Generator
 ) -> tuple[RaySet, Segments]:
-    """Launch a station's rays, this far apart [rad]."""
+    """Launch a station's rays.
+
+    Parameters
+    ----------
+    spacing : float, rad
+        Between neighbouring rays.
+    """
     rays = sample_rays(spacing, rng)
     segments = launch(
         np.array(station.position_m),

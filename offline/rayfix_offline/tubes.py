@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.joining import join_groups
 from rayfix_offline.merge import merge_runnalls
-from rayfix_offline.moments import POSITION_FLOOR, blur, gather_groups, new_rows
+from rayfix_offline.moments import POSITION_FLOOR, blur, gather_groups, gathered_arrays, new_rows
 from rayfix_offline.trace import LevelRays
 from rayfix_tables.mixture import TubeMixture, pack, widening_cov
 
@@ -55,27 +55,14 @@ def fit_tubes(
     mixture : TubeMixture
         Components of all cells.
     """
-    rays, pieces, sequences = level.rays, level.pieces, level.sequences
+    sequences = level.sequences
     counts, log_mass, log_weight, mean, cov, label = _fit_block(
         centres,
         level.window,
-        rays.grid.ring_offsets,
-        rays.grid.ring_cells,
-        rays.azimuth,
-        rays.zenith,
-        rays.solid_angle,
-        rays.directions,
-        pieces.offsets,
-        pieces.sequence,
-        pieces.slice,
-        pieces.mass,
-        pieces.mean,
-        pieces.variance,
-        sequences.images,
-        sequences.mirrors,
+        *gathered_arrays(level.rays, level.pieces, sequences),
         level.surface_sequences,
         bool(np.any(level.surface_sequences != np.arange(len(sequences.images)))),
-        pieces.num_slices,
+        level.pieces.num_slices,
         level.ray_spacing,
         fit.dropped_mass,
         fit.max_groups,

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from rayfix.evaluation.forward import Paths
 from rayfix.evaluation.simulate import Noise, Timing
 
-__all__ = ["path_gradients", "position_error_bound"]
+__all__ = ["information_bound", "path_gradients", "position_error_bound"]
 
 _SINGULAR = 1e-12  # least ratio of the eigenvalues of an information matrix that is inverted
 _SAME_PLACE = 1e-6  # m; the paths have to belong to the stations and the point
@@ -123,13 +123,40 @@ def position_error_bound(
         information += np.outer(azimuth, azimuth) / noise.azimuth_stdev**2
         information += np.outer(zenith, zenith) / noise.zenith_stdev**2
         lengths.append(length)
-    if timing != "none" and lengths:
+    return information_bound(information, lengths, noise, timing=timing)
+
+
+def information_bound(
+    information: NDArray[np.float64], lengths: Sequence[NDArray[np.float64]], noise: Noise, *, timing: Timing
+) -> float:
+    """Bound from what angles say, and from the path lengths that times measure.
+
+    Parameters
+    ----------
+    information : ndarray of shape (3, 3), 1/m2
+        Fisher information of the angles.
+    lengths : sequence of ndarray of shape (3,)
+        Gradients of the path lengths with respect to the point.
+    noise, timing
+        As of :func:`position_error_bound`.
+
+    Returns
+    -------
+    float
+        As of :func:`position_error_bound`, m.
+
+    Raises
+    ------
+    ValueError
+        If times are wanted and ``noise.range_stdev`` is None.
+    """
+    if timing != "none" and len(lengths):
         if noise.range_stdev is None:
             raise ValueError(f"the timing is {timing!r}, but noise.range_stdev is None; give it in metres")
         rows = np.array(lengths)
         if timing != "pt":
             rows = rows - rows.mean(axis=0)
-        information += rows.T @ rows / noise.range_stdev**2
+        information = information + rows.T @ rows / noise.range_stdev**2
     eigenvalues = np.linalg.eigvalsh(information)
     if not eigenvalues[0] > _SINGULAR * eigenvalues[-1]:
         return float("inf")

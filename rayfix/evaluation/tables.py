@@ -1,5 +1,6 @@
 """The table that a benchmark runs on: one from the command line, or the bundled hall's, built for it."""
 
+import argparse
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,6 +9,14 @@ from pathlib import Path
 from rayfix.example.files import write_example
 from rayfix_offline.build import build_table
 from rayfix_tables.table import Table
+
+
+def table_parser(description: str | None, *, seed: int = 2026) -> argparse.ArgumentParser:
+    """Return the command line of a benchmark on one table: ``--table`` and ``--seed``, to which it adds its own."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--table", type=Path, help="a table; the bundled hall's is built when left out")
+    parser.add_argument("--seed", type=int, default=seed)
+    return parser
 
 
 @contextmanager

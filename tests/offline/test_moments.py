@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rayfix_offline.launch import Segments, Sequences
-from rayfix_offline.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR, blur, gather_groups, new_rows
+from rayfix_offline.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR, blur, gather_groups, gathered_arrays, new_rows
 from rayfix_offline.pathprior import PathPrior
 from rayfix_offline.pieces import Pieces, cut_pieces
 from rayfix_offline.rays import RaySet, sample_rays
@@ -45,20 +45,7 @@ def gather(traced: Traced, centre: tuple[float, float], window: float, rows: NDA
     sequence, slices, mass, mean, cov = gather_groups(
         *centre,
         window,
-        rays.grid.ring_offsets,
-        rays.grid.ring_cells,
-        rays.azimuth,
-        rays.zenith,
-        rays.solid_angle,
-        rays.directions,
-        pieces.offsets,
-        pieces.sequence,
-        pieces.slice,
-        pieces.mass,
-        pieces.mean,
-        pieces.variance,
-        traced.sequences.images,
-        traced.sequences.mirrors,
+        *gathered_arrays(rays, pieces, traced.sequences),
         pieces.num_slices,
         new_rows(len(traced.sequences.images)) if rows is None else rows,
     )

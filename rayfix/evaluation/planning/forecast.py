@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix.evaluation.accuracy import clear_of_solids
+from rayfix.evaluation.bound import information_bound
 from rayfix.evaluation.planning.heard import HeardPaths, heard_paths
 from rayfix.evaluation.simulate import Noise, Timing, fold_direction
 from rayfix_service.fusion.locator import Locator
@@ -23,7 +24,6 @@ Progress = Callable[[int, int], None]
 """Told how many reports are located, and of how many."""
 
 _MARGIN = 0.06  # m; places nearer to solids are left out
-_SINGULAR = 1e-12  # least ratio of the eigenvalues of an information matrix that is inverted
 _TRIES = 10  # places that are tried for each that is drawn
 _CLOCK = 100.0  # m; where a simulated clock stands
 
@@ -214,16 +214,7 @@ def _bound(paths: Sequence[HeardPaths], place: int, settings: PlanSettings) -> f
         information += np.outer(horizontal, horizontal) / across**2
         information += np.outer(vertical, vertical) / noise.zenith_stdev**2
         lengths.append(length)
-    if settings.timing != "none" and lengths:
-        assert noise.range_stdev is not None  # the settings saw to it
-        rows = np.array(lengths)
-        if settings.timing != "pt":
-            rows = rows - rows.mean(axis=0)
-        information += rows.T @ rows / noise.range_stdev**2
-    eigenvalues = np.linalg.eigvalsh(information)
-    if not eigenvalues[0] > _SINGULAR * eigenvalues[-1]:
-        return float("inf")
-    return float(np.sqrt(np.sum(1.0 / eigenvalues)))
+    return information_bound(information, lengths, noise, timing=settings.timing)
 
 
 def _outlook(locator: Locator, measurements: tuple[Measurement, ...], threshold: float) -> tuple[float, float]:
