@@ -16,7 +16,7 @@ from rayfix_service.fusion.factors import make_factor
 from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.likelihood import Term, gaussian_terms, log_normal_terms, spreads
 from rayfix_service.fusion.lookup import Direction
-from rayfix_service.fusion.modes import unit_points
+from rayfix_service.fusion.normal import unit_points
 from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.report import GAUSSIAN, ErrorModel

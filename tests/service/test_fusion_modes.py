@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from rayfix_service.fusion import mode_kernels, reference
-from rayfix_service.fusion.modes import cut_to_free_space, find_modes, unit_points
+from rayfix_service.fusion.modes import cut_to_free_space, find_modes
+from rayfix_service.fusion.normal import unit_points
 from rayfix_tables.freespace import FreeSpace
 
 Array = NDArray[np.float64]

@@ -5,7 +5,6 @@ Gaussian, and what lies in the free space gives the cut one's weight, mean and c
 """
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,25 +42,6 @@ class Modes:
     member: NDArray[np.int64]
 
 
-@cache
-def unit_points(count: int = 128) -> NDArray[np.float64]:
-    """Points that stand for a standard normal in three dimensions, shape (count, 3): mean 0, covariance 1 exactly."""
-    # An additive recurrence in three dimensions on the generalised golden ratio, mapped to the sphere and the radius.
-    ratio = 1.2207440846057596
-    index = np.arange(1, count // 2 + 1)
-    uniform = (0.5 + index[:, None] * ratio ** -np.arange(1.0, 4.0)) % 1.0
-    normal = np.sqrt(-2.0 * np.log(uniform[:, :1])) * np.stack(
-        [np.cos(2.0 * np.pi * uniform[:, 1]), np.sin(2.0 * np.pi * uniform[:, 1])], axis=1
-    )
-    third = np.sqrt(-2.0 * np.log(np.roll(uniform[:, 0], count // 4))) * np.cos(2.0 * np.pi * uniform[:, 2])
-    points = np.concatenate([normal, third[:, None]], axis=1)
-    points = np.concatenate([points, -points])
-    root = np.linalg.cholesky(np.cov(points.T, bias=True))
-    unit = np.ascontiguousarray(np.linalg.solve(root, points.T).T)
-    unit.flags.writeable = False
-    return unit
-
-
 def cut_to_free_space(
     log_weight: NDArray[np.float64],
     mean: NDArray[np.float64],
@@ -74,7 +54,7 @@ def cut_to_free_space(
     Parameters
     ----------
     points : ndarray of shape (n, 3)
-        From :func:`unit_points`.
+        From :func:`rayfix_service.fusion.normal.unit_points`.
     """
     mean, cov, share = mean.copy(), cov.copy(), np.empty(len(mean))
     cut_gaussians(mean, cov, points, free_space.origin, free_space.voxel_size, free_space.free, share)
