@@ -1,11 +1,16 @@
 """Requests per second of the service, beside a plain FastAPI endpoint that computes nothing, and its memory.
 
-    python benchmarks/http_load.py hall.h5 [--workers 1 2] [--seconds 5] [--rounds 3] [--memory 200000 | --swaps 20]
+    python benchmarks/http_load.py hall.h5 [--workers 1 2] [--seconds 5] [--rounds 3] [--swaps 20]
+    python benchmarks/http_load.py hall.h5 --memory 200000
+    python benchmarks/http_load.py hall.h5 --steady 15 [--rate 100]
 
 The load comes from `wrk` (Debian package wrk) over 16 connections on loopback. Both servers are uvicorn with the same
 settings; the plain one validates the same report with the same models and answers with the example of a fix. They take
 turns, and the medians of the rounds are compared, since other work on the machine slows both. The processor time that
 each server takes for a request is less disturbed by it.
+
+`--memory` loads one process as fast as it goes, `--steady` several for minutes at a moderate rate with reports of all
+kinds; both print the memory of the service's processes.
 """
 
 import argparse
@@ -105,24 +110,49 @@ def plain_command(workers: int) -> list[str]:
     return [sys.executable, "-m", "uvicorn", f"{Path(__file__).stem}:plain", *options]
 
 
+def processes(pid: int) -> Iterator[int]:
+    """Yield a process and all that it started."""
+    waiting = [pid]
+    while waiting:
+        yield (each := waiting.pop())
+        waiting += [int(c) for t in Path(f"/proc/{each}/task").iterdir() for c in (t / "children").read_text().split()]
+
+
 def processor_seconds(pid: int) -> float:
     """Processor time of a process and its children so far."""
-    total, waiting = 0, [pid]
-    while waiting:
-        each = waiting.pop()
+    total = 0
+    for each in processes(pid):
         fields = Path(f"/proc/{each}/stat").read_text().rpartition(")")[2].split()
         total += int(fields[11]) + int(fields[12])
-        waiting += [int(c) for t in Path(f"/proc/{each}/task").iterdir() for c in (t / "children").read_text().split()]
     return total / os.sysconf("SC_CLK_TCK")
 
 
-def load(server: tuple[str, int], path: str, document: Any, *, seconds: float, connections: int = CONNECTIONS) -> Load:
-    """Post a document to a server, a URL and a process, over and over."""
+def memory_of(pid: int) -> tuple[float, float]:
+    """Memory of a process, MiB: all that is resident, and what of it no other process shares."""
+    kinds = dict(re.findall(r"^(\w+):\s+(\d+) kB", Path(f"/proc/{pid}/smaps_rollup").read_text(), flags=re.MULTILINE))
+    return int(kinds["Rss"]) / 1024, (int(kinds["Private_Clean"]) + int(kinds["Private_Dirty"])) / 1024
+
+
+def load(
+    server: tuple[str, int],
+    path: str,
+    *documents: Any,
+    seconds: float,
+    connections: int = CONNECTIONS,
+    rate: float | None = None,
+) -> Load:
+    """Post documents to a server, a URL and a process, in turns, over and over; at most so many a second."""
     url, pid = server
+    bodies = ", ".join(json.dumps(json.dumps(document)) for document in documents)
+    delay = f"delay = function() return math.random() * {2e3 * connections / rate} end" if rate else ""
     script = f"""
-wrk.method = "POST"
-wrk.headers["Content-Type"] = "application/json"
-wrk.body = {json.dumps(json.dumps(document))}
+local bodies, turn = {{{bodies}}}, 0
+local headers = {{["Content-Type"] = "application/json"}}
+request = function()
+  turn = turn % #bodies + 1
+  return wrk.format("POST", nil, headers, bodies[turn])
+end
+{delay}
 done = function(summary, latency)
   local e = summary.errors
   io.write(string.format("RESULT %d %f %f %f %d\\n", summary.requests, summary.duration / 1e6,
@@ -188,8 +218,22 @@ def memory(table: Path, requests: int) -> None:
             begin = time.monotonic()
             run = load((url, pid), "/v1/positions", REPORT, seconds=10)
             done += run.per_second * (time.monotonic() - begin)
-            resident = re.findall(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())[0]
-            print(f"{done:9.0f} requests   {int(resident) / 1024:7.1f} MiB   failed {run.failed}", flush=True)
+            print(f"{done:9.0f} requests   {memory_of(pid)[0]:7.1f} MiB   failed {run.failed}", flush=True)
+
+
+def steady(table: Path, workers: int, minutes: int, rate: float) -> None:
+    """Print the memory of all processes after each minute of a moderate load with reports of all kinds."""
+    reports = [example["value"] for example in REPORT_EXAMPLES.values()]
+    with server(rayfix_command(table, workers)) as (url, pid):
+        for minute in range(minutes + 1):
+            seconds = 60.0 if minute else 5.0
+            run = load((url, pid), "/v1/positions", *reports, seconds=seconds, rate=rate)
+            each = "   ".join(f"{all_:6.1f} ({own:6.1f})" for all_, own in map(memory_of, processes(pid)))
+            print(
+                f"minute {minute:3}   {run.per_second:6.1f} requests/s   median {run.median_ms:5.2f} ms   "
+                f"p99 {run.p99_ms:6.2f} ms   failed {run.failed}   resident (own) MiB: {each}",
+                flush=True,
+            )
 
 
 def swaps(table: Path, times: int, workers: int) -> None:
@@ -221,12 +265,17 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="of each run (default: 5)")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--memory", type=int, metavar="REQUESTS", help="watch the memory over so many instead")
+    parser.add_argument("--steady", type=int, metavar="MINUTES", help="watch it for so long at a moderate rate instead")
+    parser.add_argument("--rate", type=float, default=100.0, help="requests a second of --steady (default: 100)")
     parser.add_argument("--swaps", type=int, metavar="TIMES", help="swap the table under load instead")
     options = parser.parse_args()
     if shutil.which("wrk") is None:
         sys.exit("wrk is missing; install the Debian package wrk")
     if options.memory:
         memory(options.table, options.memory)
+        return
+    if options.steady:
+        steady(options.table, options.workers[-1], options.steady, options.rate)
         return
     if options.swaps:
         for workers in options.workers:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 
 from rayfix_service.fusion import reference
+from rayfix_service.fusion.axes import semi_axes
 from rayfix_service.fusion.beam import Hypotheses
 from rayfix_service.fusion.credible import CredibleRegions, Ellipsoid, posterior_points
 from rayfix_service.fusion.normal import normal_points
@@ -92,6 +93,28 @@ def test_the_ellipsoid_is_of_the_covariances_shape() -> None:
         assert abs(found @ axis) == pytest.approx(np.linalg.norm(found), rel=0.02)
         assert ellipsoid.holds(ellipsoid.centre + 0.999 * found)
         assert not ellipsoid.holds(ellipsoid.centre + 1.001 * found)
+
+
+@pytest.mark.parametrize(
+    "stdevs", [(1.0, 1.0, 1.0), (3.0, 1.0, 1.0), (3.0, 3.0, 1.0), (30.0, 1e-3, 1.0), (1.0, 0.0, 0.0)]
+)
+@pytest.mark.parametrize("seed", range(20))
+def test_semi_axes_are_those_of_the_eigenvectors(stdevs: tuple[float, float, float], seed: int) -> None:
+    """NumPy's eigenvectors are the oracle; where two axes are as long, only what they span is determined."""
+    rotation = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    shape = rotation @ np.diag(np.square(stdevs)) @ rotation.T
+    shape = 0.5 * (shape + shape.T)
+    found = semi_axes(shape)
+    np.testing.assert_allclose(found.T @ found, shape, atol=1e-14 * shape.trace())
+    squares = np.sum(found**2, axis=1)
+    np.testing.assert_allclose(squares, np.maximum(np.linalg.eigvalsh(shape)[::-1], 0.0), atol=1e-14 * shape.trace())
+    across = found @ found.T - np.diag(squares)
+    np.testing.assert_allclose(across, 0.0, atol=1e-14 * shape.trace())
+
+
+def test_semi_axes_along_the_frame_are_exact() -> None:
+    np.testing.assert_array_equal(semi_axes(np.diag([1.0, 9.0, 4.0])), [[0, 3, 0], [0, 0, 2], [1, 0, 0]])
+    np.testing.assert_array_equal(semi_axes(np.zeros((3, 3))), 0.0)
 
 
 def test_the_upright_ellipsoid_has_a_vertical_axis() -> None:

@@ -13,6 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_service.fusion.axes import semi_axes
 from rayfix_service.fusion.kernels import cholesky
 from rayfix_service.fusion.voxels import is_free
 from rayfix_tables.freespace import FreeSpace
@@ -42,8 +43,7 @@ class Ellipsoid:
     @property
     def semi_axes(self) -> NDArray[np.float64]:
         """Vectors from the centre to the ends of the axes, longest first, as rows, shape (3, 3), m."""
-        squares, axes = np.linalg.eigh(self.shape)
-        return np.asarray((axes * np.sqrt(np.maximum(squares, 0.0))).T[::-1])
+        return np.asarray(semi_axes(self.shape))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rayfix_service.fusion.axes import semi_axes
 from rayfix_service.fusion.beam import Hypotheses, multiply
 from rayfix_service.fusion.credible import CredibleRegions
 from rayfix_service.fusion.factors import Factor, make_factor
@@ -116,6 +117,7 @@ class Locator:
         regions = CredibleRegions(position=np.zeros(3), covariance=np.eye(3), points=np.zeros((1, 3)), share=1.0)
         regions.accuracies(0.5)
         regions.upright_ellipsoid(0.5)
+        semi_axes(np.eye(3))
 
     def _product(self, report: Report) -> Product:
         """Multiply what the measurements say."""
