@@ -13,11 +13,10 @@ from typing import Any
 import numba
 import numpy as np
 
+from rayfix_tables.halving import SMALLEST_PIVOT
+
 LANES = 128
 """Pairs whose determinants are computed side by side; their matrices fit the processor's first cache."""
-
-SMALLEST_PIVOT = 1e-30
-"""A covariance that rounding has made singular counts as this thin."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

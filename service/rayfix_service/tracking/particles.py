@@ -9,6 +9,7 @@ dropped and another drawn.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -93,19 +94,14 @@ def predict(
     """Move particles without a report; None where all ways are blocked."""
     step = step_of(model, particles.velocity_variance, seconds)
     middle = particles.position + seconds * particles.velocity
-    kept_from, kept_to = np.empty(0, np.int64), np.empty((0, 3))
     count = len(particles)
-    for _ in range(_ROUNDS):
-        origin = rng.integers(count, size=count) if len(kept_from) else np.arange(count)
-        drawn = middle[origin] + np.sqrt(step.variance) * rng.standard_normal((count, 3))
-        free = walls.passable(particles.position[origin], drawn)
-        kept_from, kept_to = np.concatenate([kept_from, origin[free]]), np.concatenate([kept_to, drawn[free]])
-        if len(kept_from) >= count:
-            break
-    if not len(kept_from):
-        return None
-    chosen = _exactly(np.arange(len(kept_from)), count, rng)
-    return _moved(particles, step, kept_from[chosen], kept_to[chosen], middle)
+
+    def draw(num_kept: int) -> tuple[NDArray[np.int64], Array]:
+        origin = rng.integers(count, size=count) if num_kept else np.arange(count)
+        return origin, middle[origin] + np.sqrt(step.variance) * rng.standard_normal((count, 3))
+
+    ways = _free_ways(particles, walls, draw, rng)
+    return None if ways is None else _moved(particles, step, ways, middle)
 
 
 def update(
@@ -134,28 +130,20 @@ def update(
     count, alternatives = weight.shape
     log_sum = top + math.log(weight.sum()) - math.log(count)
     roots = np.linalg.cholesky(cov)
-    kept_from, kept_to = np.empty(0, np.int64), np.empty((0, 3))
-    tried = 0
-    for _ in range(_ROUNDS):
+
+    def draw(num_kept: int) -> tuple[NDArray[np.int64], Array]:
         origin, chosen = np.divmod(_systematic(weight.ravel(), count, rng), alternatives)
         mean = middle[origin]
         pull = likelihood.slope[chosen] - np.einsum(
             "nij,nj->ni", likelihood.information[chosen], mean - likelihood.mean[chosen]
         )
         noise = rng.standard_normal((count, 3))
-        drawn = mean + np.einsum("nij,nj->ni", cov[chosen], pull) + np.einsum("nij,nj->ni", roots[chosen], noise)
-        free = walls.passable(particles.position[origin], drawn)
-        tried += count
-        kept_from, kept_to = np.concatenate([kept_from, origin[free]]), np.concatenate([kept_to, drawn[free]])
-        if len(kept_from) >= count:
-            break
-    if not len(kept_from):
+        return origin, mean + np.einsum("nij,nj->ni", cov[chosen], pull) + np.einsum("nij,nj->ni", roots[chosen], noise)
+
+    ways = _free_ways(particles, walls, draw, rng)
+    if ways is None:
         return None
-    chosen = _exactly(np.arange(len(kept_from)), count, rng)
-    return Updated(
-        particles=_moved(particles, step, kept_from[chosen], kept_to[chosen], middle),
-        log_evidence=log_sum + math.log(len(kept_from) / tried),
-    )
+    return Updated(particles=_moved(particles, step, ways, middle), log_evidence=log_sum + math.log(ways.free_share))
 
 
 def mixed(track: Particles, newborn: Particles, share: float, rng: np.random.Generator) -> Particles:
@@ -206,11 +194,57 @@ def _pair_evidences(middle: Array, step: Step, likelihood: Likelihood, cov: Arra
     return np.asarray(features @ factors.T + constant)
 
 
-def _moved(particles: Particles, step: Step, origin: NDArray[np.int64], position: Array, middle: Array) -> Particles:
-    """Particles at new positions, their velocities conditioned on these."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Ways:
+    """Ways through the free space, as many as there are particles.
+
+    Attributes
+    ----------
+    origin : ndarray of int64, shape (n,)
+        Particle that each way begins at.
+    end : ndarray of shape (n, 3), m
+    free_share : float
+        Of the ways that were tried, those that nothing blocks.
+    """
+
+    origin: NDArray[np.int64]
+    end: Array
+    free_share: float
+
+
+def _free_ways(
+    particles: Particles,
+    walls: Walls,
+    draw: Callable[[int], tuple[NDArray[np.int64], Array]],
+    rng: np.random.Generator,
+) -> _Ways | None:
+    """Draw ways until as many are free as there are particles; None where all are blocked.
+
+    Parameters
+    ----------
+    draw : callable
+        Told how many are free so far, draws the origins and ends of as many ways as there are particles.
+    """
+    count = len(particles)
+    origins, ends, tried = np.empty(0, np.int64), np.empty((0, 3)), 0
+    for _ in range(_ROUNDS):
+        origin, end = draw(len(origins))
+        free = walls.passable(particles.position[origin], end)
+        tried += count
+        origins, ends = np.concatenate([origins, origin[free]]), np.concatenate([ends, end[free]])
+        if len(origins) >= count:
+            break
+    if not len(origins):
+        return None
+    chosen = _exactly(np.arange(len(origins)), count, rng)
+    return _Ways(origin=origins[chosen], end=ends[chosen], free_share=len(origins) / tried)
+
+
+def _moved(particles: Particles, step: Step, ways: _Ways, middle: Array) -> Particles:
+    """Particles at the ends of their ways, their velocities conditioned on these."""
     return Particles(
-        position=position,
-        velocity=particles.velocity[origin] + step.gain * (position - middle[origin]),
+        position=ways.end,
+        velocity=particles.velocity[ways.origin] + step.gain * (ways.end - middle[ways.origin]),
         velocity_variance=step.velocity_variance,
     )
 

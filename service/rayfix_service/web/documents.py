@@ -18,8 +18,7 @@ from rayfix_service.wire import (
     path_text,
     read_json,
 )
-
-Matrix = Annotated[list[Annotated[list[float], Field(min_length=3, max_length=3)]], Field(min_length=3, max_length=3)]
+from rayfix_service.wire.points import Matrix
 
 
 class ViewerSettings(BaseModel):
