@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from rayfix.extras import needs_extra
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
 
 with needs_extra("service"):
+    from rayfix_service.batch import locate_batch
     from rayfix_service.fusion.locator import Fused
     from rayfix_service.fusion.locator import Locator as _Locator
     from rayfix_service.fusion.posterior import Posterior
@@ -87,25 +88,30 @@ class Locator(_Locator):
         """
         return super().locate(report if isinstance(report, Report) else parse_report(report))
 
-    def locate_batch(
-        self, reports: Sequence[Report | Mapping[str, Any]], *, threads: int | None = None
-    ) -> list[Fix | ReportError]:
-        """Fuse the measurements of many reports, several at a time.
+    def locate_batch(self, reports: Sequence[Report | Mapping[str, Any]], *, jobs: int = -1) -> list[Fix | ReportError]:
+        """Fuse the measurements of many reports, on several processor cores.
 
         Parameters
         ----------
         reports : sequence of Report or mapping
             Mappings have the form of the JSON that ``POST /v1/positions`` takes.
-        threads : int, optional
-            As many as there are processor cores when left out.
+        jobs : int
+            Processes; -1 for one per core. With 1, everything happens in this one, as it does with 64 reports or fewer.
+            Others start with the first call, within seconds, and wait for the next for some minutes.
 
         Returns
         -------
         list of Fix or ReportError
             Of each report in turn what :meth:`locate` returns or raises.
+
+        Raises
+        ------
+        TableError
+            When the file of the locator's table is no longer that table.
+        RayfixError
+            When a process ends early.
         """
-        # It calls :meth:`locate`, which takes either.
-        return super().locate_batch(cast("Sequence[Report]", reports), threads=threads)
+        return locate_batch(self, reports, jobs=jobs)
 
     def posterior(self, report: Report | Mapping[str, Any]) -> Posterior:
         """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.

@@ -1,8 +1,5 @@
 """The face of the fusion: a table and a report in, a fix out."""
 
-import os
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,11 +15,7 @@ from rayfix_service.fusion.posterior import Posterior, make_posterior
 from rayfix_service.fusion.prior import Prior, even_prior, height_prior
 from rayfix_service.fusion.report import Angle, Fix, Range, Report
 from rayfix_service.fusion.settings import FusionSettings
-from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
-
-_BLOCK = 16
-"""Reports of a batch that a thread takes at a time."""
 
 _NO_RAYS = "no ray of station '{}' comes from that direction"
 
@@ -51,36 +44,6 @@ class Locator:
             When the report cannot be used; its ``path`` names the field.
         """
         return make_fix(report, self._product(report), self.table, self.settings)
-
-    def locate_batch(self, reports: Sequence[Report], *, threads: int | None = None) -> list[Fix | ReportError]:
-        """Fuse the measurements of many reports, several at a time.
-
-        Parameters
-        ----------
-        reports : sequence of Report
-        threads : int, optional
-            As many as there are processor cores when left out.
-
-        Returns
-        -------
-        list of Fix or ReportError
-            Of each report in turn what :meth:`locate` returns or raises.
-        """
-        blocks = [reports[begin : begin + _BLOCK] for begin in range(0, len(reports), _BLOCK)]
-        threads = min(threads or os.cpu_count() or 1, len(blocks))
-        if threads < 2:
-            return [answer for block in blocks for answer in self._locate_block(block)]
-        with ThreadPoolExecutor(threads) as pool:
-            return [answer for answers in pool.map(self._locate_block, blocks) for answer in answers]
-
-    def _locate_block(self, reports: Sequence[Report]) -> list[Fix | ReportError]:
-        answers: list[Fix | ReportError] = []
-        for report in reports:
-            try:
-                answers.append(self.locate(report))
-            except ReportError as error:
-                answers.append(error)
-        return answers
 
     def fuse(self, report: Report) -> "Fused":
         """Locate a report and keep what its fix was made of, for filters that go on with it.

@@ -103,7 +103,9 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
     unused: dict[int, str] = {}
     for index, measurement in enumerate(report.measurements):
         station = _station(stations, measurement.station_id, index, "station_id")
-        draft = drafts.setdefault(station.id, _Draft(station=station))
+        draft = drafts.get(station.id)
+        if draft is None:
+            draft = drafts[station.id] = _Draft(station=station)
         bias = station.bias
         match measurement:
             case Angle(error_model=model):

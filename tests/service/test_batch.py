@@ -1,14 +1,16 @@
-"""Many reports in one call."""
+"""Many reports in one call, in this process and in others."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rayfix_service.batch import locate_batch
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import Angle, Fix, Range, Report
 from rayfix_tables.angles import angles_of
-from rayfix_tables.errors import ReportError
+from rayfix_tables.errors import ReportError, TableError
 from rayfix_tables.table import Table
 
 
@@ -44,11 +46,10 @@ def one_by_one(locator: Locator, report: Report) -> Fix | ReportError:
         return error
 
 
-@pytest.mark.parametrize("threads", [None, 1, 3])
-@pytest.mark.parametrize("count", [0, 1, 50])
-def test_a_batch_is_its_reports_one_by_one(locator: Locator, count: int, threads: int | None) -> None:
+@pytest.mark.parametrize(("count", "jobs"), [(0, -1), (1, -1), (50, 1), (150, 2)])
+def test_a_batch_is_its_reports_one_by_one(locator: Locator, count: int, jobs: int) -> None:
     given = reports(locator, count)
-    answers = locator.locate_batch(given, threads=threads)
+    answers = locate_batch(locator, given, jobs=jobs)
     assert len(answers) == count
     for n, (answer, report) in enumerate(zip(answers, given, strict=True)):
         expected = one_by_one(locator, report)
@@ -68,3 +69,11 @@ def test_a_batch_is_its_reports_one_by_one(locator: Locator, count: int, threads
             np.testing.assert_array_equal(one.position, other.position)
             np.testing.assert_array_equal(one.covariance, other.covariance)
     assert count < 50 or len({answer.status for answer in answers if isinstance(answer, Fix)}) > 1
+
+
+def test_a_table_that_was_replaced_is_not_mixed_with_the_new_one(locator: Locator) -> None:
+    former = Locator(replace(locator.table, table_id="of the file that was there before"))
+    given = reports(locator, 150)
+    with pytest.raises(TableError, match="another table since it was opened"):
+        locate_batch(former, given, jobs=2)
+    assert len(locate_batch(former, given, jobs=1)) == 150

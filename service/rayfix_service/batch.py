@@ -1,0 +1,90 @@
+"""Many reports in one call, on several processor cores.
+
+A fix is half compiled loops and half Python, which one thread of a process runs at a time, so that threads gain
+nothing; processes do. Each maps the table's file, which they therefore share in memory.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from joblib import Parallel, delayed, effective_n_jobs
+
+from rayfix_service.fusion.locator import Locator
+from rayfix_service.fusion.report import Fix, Report
+from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.wire import parse_report
+from rayfix_tables.errors import RayfixError, ReportError, TableError
+from rayfix_tables.table import Table
+
+_BLOCK = 64
+"""Reports that a process takes at a time; no more than these are not worth another process."""
+
+
+def locate_batch(
+    locator: Locator, reports: Sequence[Report | Mapping[str, Any]], *, jobs: int = -1
+) -> list[Fix | ReportError]:
+    """Fuse the measurements of many reports.
+
+    Parameters
+    ----------
+    locator : Locator
+    reports : sequence of Report or mapping
+        Mappings have the form of the JSON that ``POST /v1/positions`` takes.
+    jobs : int
+        Processes; -1 for one per core. With 1, everything happens in this one, as it does with 64 reports or fewer.
+        Others start with the first call, within seconds, and wait for the next for some minutes.
+
+    Returns
+    -------
+    list of Fix or ReportError
+        Of each report in turn what :meth:`~rayfix_service.fusion.locator.Locator.locate` returns or raises.
+
+    Raises
+    ------
+    TableError
+        When the file of the locator's table is no longer that table.
+    RayfixError
+        When a process ends early.
+    """
+    blocks = [reports[begin : begin + _BLOCK] for begin in range(0, len(reports), _BLOCK)]
+    jobs = min(effective_n_jobs(jobs), len(blocks))
+    if jobs < 2:
+        return _locate_block(locator, reports)
+    table = locator.table
+    named = table.path.resolve(), table.table_id, locator.settings
+    parallel = Parallel(n_jobs=jobs, backend="loky", batch_size=1, pre_dispatch="all")
+    try:
+        answers = parallel(delayed(_locate_elsewhere)(*named, block) for block in blocks)
+    except BrokenProcessPool as error:
+        raise RayfixError(
+            "a process that located reports ended early, as it does when memory runs out; give fewer reports or jobs"
+        ) from error
+    return [answer for block in answers for answer in block]
+
+
+def _locate_block(locator: Locator, reports: Sequence[Report | Mapping[str, Any]]) -> list[Fix | ReportError]:
+    answers: list[Fix | ReportError] = []
+    for report in reports:
+        try:
+            answers.append(locator.locate(report if isinstance(report, Report) else parse_report(report)))
+        except ReportError as error:
+            answers.append(error)
+    return answers
+
+
+def _locate_elsewhere(
+    path: Path, table_id: str, settings: FusionSettings, reports: Sequence[Report | Mapping[str, Any]]
+) -> list[Fix | ReportError]:
+    return _locate_block(_locator(path, table_id, settings), reports)
+
+
+@lru_cache(maxsize=4)
+def _locator(path: Path, table_id: str, settings: FusionSettings) -> Locator:
+    """Give this process's locator for a table."""
+    table = Table.open(path)
+    if table.table_id != table_id:
+        raise TableError(f"{path} has become another table since it was opened; open it again")
+    return Locator(table, settings)
