@@ -47,9 +47,7 @@ def main() -> None:
         locator, paper = Locator(table), PaperLocator.of_table(table)
         locator.warm_up()
         print(f"{len(drops)} reports of {len(table.site.stations)} stations; {DEGREES:g} deg, {RANGE_STDEV:g} m")
-        print(
-            "             rayfix: time [ms]  error [m]         paper: time [ms]  error [m]      ratio  fixes/s, jobs"
-        )
+        print("             rayfix: time [ms]  error [m]         paper: time [ms]  error [m]      ratio  fixes/s, jobs")
         print("measured        50 %    90 %     50 %    90 %        50 %     50 %    90 %   of times       1       2")
         for label, timing, angles in CASES:
             reports = [report_of(drop, timing, angles, n, options.seed) for n, drop in enumerate(drops)]

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +90,7 @@ class Bench:
         -------
         run : Run
         seconds : ndarray of shape (n,)
-            Time that each answer took; 0 where there was no report.
+            Processor time that each answer took; 0 where there was no report.
         """
         stations = self.table.site.stations
         answering = self._method(method)
@@ -110,9 +110,9 @@ class Bench:
                 truth=drop.position,
                 rng=np.random.default_rng([self.settings.seed, _METHOD, number]),
             )
-            begin = perf_counter()
+            begin = process_time()
             answer = _answer(answering, question)
-            seconds[n] = perf_counter() - begin
+            seconds[n] = process_time() - begin
             if answer.position is not None:
                 error[n] = np.linalg.norm(answer.position - drop.position)
             if answer.covered is not None:

@@ -48,7 +48,7 @@ class Evaluation:
     results : dict
         The same for the same site, table, seed and version, as JSON-compatible data.
     timings : dict
-        Milliseconds that answers took; different each time.
+        Milliseconds of processor time that answers took; different each time.
     pictures : dict
         Points, rays and mixtures of one report, for the pictures of it.
     table : Table

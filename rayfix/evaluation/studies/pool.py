@@ -46,7 +46,7 @@ class Done:
     Attributes
     ----------
     seconds : ndarray of shape (n_drops,)
-        Time that each answer took.
+        Processor time that each answer took.
     """
 
     task: Task
