@@ -15,6 +15,7 @@ import pytest
 
 from rayfix_offline.build import build_table
 from tests.support.server_process import start_rayfix_serve
+from tests.support.sites import stations_text
 
 TARGETS, HERTZ, SECONDS = 20, 5.0, 6.0
 
@@ -35,9 +36,8 @@ STATIONS = {"a": (-6.0, -9.0, 4.5), "b": (6.0, -9.0, 4.5), "c": (-6.0, 9.0, 4.5)
 def warehouse_table_path(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Table of the warehouse's visual mesh of 25 thousand triangles, with wide windows."""
     folder = tmp_path_factory.mktemp("warehouse")
-    stations = "".join(f'[[stations]]\nid = "{name}"\nposition_m = {list(p)}\n' for name, p in STATIONS.items())
     scene = shared_data / "warehouse" / "warehouse_visual.ply"
-    (folder / "site.toml").write_text(SITE.format(scene=scene) + stations, encoding="utf-8")
+    (folder / "site.toml").write_text(SITE.format(scene=scene) + stations_text(STATIONS), encoding="utf-8")
     build_table(folder / "site.toml", folder / "warehouse.h5")
     return folder / "warehouse.h5"
 

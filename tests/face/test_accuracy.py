@@ -15,6 +15,7 @@ from rayfix_service.fusion.locator import Locator
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Table
 from tests.support.running_app import RunningApp
+from tests.support.sites import stations_text
 
 
 @pytest.fixture(scope="module")
@@ -80,12 +81,9 @@ def warehouse_table(shared_data: Path, tmp_path_factory: pytest.TempPathFactory)
     """Table of the real hall of ../shared/data, with windows that suit angles of 2 deg."""
     folder = tmp_path_factory.mktemp("warehouse")
     scene = (shared_data / "warehouse" / "warehouse_collision.ply").resolve()
-    stations = "".join(
-        f'[[stations]]\nid = "{name}"\nposition_m = {list(position)}\n' for name, position in WAREHOUSE_STATIONS.items()
-    )
     (folder / "site.toml").write_text(
         f'[site]\nname = "warehouse"\nscene = "{scene}"\n'
-        f"[propagation]\nmax_reflections = 2\n[table]\nwindows_deg = [2.5]\n{stations}",
+        f"[propagation]\nmax_reflections = 2\n[table]\nwindows_deg = [2.5]\n{stations_text(WAREHOUSE_STATIONS)}",
         encoding="utf-8",
     )
     build_table(folder / "site.toml", folder / "warehouse.h5")

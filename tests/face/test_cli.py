@@ -15,6 +15,7 @@ import pytest
 
 from rayfix.cli import main
 from rayfix.example.drop import EXAMPLE_POSITION
+from rayfix.example.files import write_example
 from rayfix_tables.table import Table
 
 
@@ -27,6 +28,17 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int
         status = int(stop.code or 0)
     captured = capsys.readouterr()
     return status, captured.out, captured.err
+
+
+def changed_example(folder: Path, changes: dict[str, str]) -> Path:
+    """Write the example with other texts in its site file, and return that."""
+    site = write_example(folder)
+    text = site.read_text(encoding="utf-8")
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    site.write_text(text, encoding="utf-8")
+    return site
 
 
 def one_line(text: str) -> str:
@@ -118,12 +130,10 @@ def test_locate_takes_and_gives_other_formats(
 
 def test_an_updated_table_says_so(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Closing gaps by a hair: nothing visible changes, but the scene is another one."""
-    run(capsys, "example", tmp_path)
-    site, table = tmp_path / "site.toml", tmp_path / "t.h5"
-    text = site.read_text(encoding="utf-8")
-    text = text.replace("[1.25, 5, 15]", "[15.0]").replace("max_reflections = 3", "max_reflections = 1")
-    site.write_text(text, encoding="utf-8")
+    site = changed_example(tmp_path, {"[1.25, 5, 15]": "[15.0]", "max_reflections = 3": "max_reflections = 1"})
+    table = tmp_path / "t.h5"
     assert run(capsys, "build", site, "-o", table, "--no-progress")[0] == 0
+    text = site.read_text(encoding="utf-8")
     site.write_text(text.replace("reflection_loss_db = 6.0", "reflection_loss_db = 6.01"), encoding="utf-8")
     status, out, err = run(capsys, "build", site, "-o", table, "--tolerance", "0.05", "--no-progress")
     assert (status, err) == (0, "")
@@ -148,11 +158,7 @@ def test_a_tolerance_that_is_no_share(capsys: pytest.CaptureFixture[str], tmp_pa
 
 
 def test_build_writes_a_table_and_a_summary(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    run(capsys, "example", tmp_path)
-    site = tmp_path / "site.toml"
-    text = site.read_text(encoding="utf-8")
-    text = text.replace("[1.25, 5, 15]", "[10.0]").replace("max_reflections = 3", "max_reflections = 1")
-    site.write_text(text, encoding="utf-8")
+    site = changed_example(tmp_path, {"[1.25, 5, 15]": "[10.0]", "max_reflections = 3": "max_reflections = 1"})
     status, out, err = run(capsys, "build", site, "-o", tmp_path / "t.h5", "--no-progress")
     assert (status, err) == (0, "")
     assert Table.open(tmp_path / "t.h5").table_id in out
@@ -213,11 +219,7 @@ def test_locate_names_what_is_wrong_with_a_report(
 
 
 def test_check_lists_all_problems_at_once(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    run(capsys, "example", tmp_path)
-    site = tmp_path / "site.toml"
-    text = site.read_text(encoding="utf-8")
-    text = text.replace("[0.1, 0.1, 2.4]", "[1.9, 1.9, 1.0]").replace("[7.9, 0.1, 2.4]", "[9.0, 0.1, 2.4]")
-    site.write_text(text, encoding="utf-8")
+    site = changed_example(tmp_path, {"[0.1, 0.1, 2.4]": "[1.9, 1.9, 1.0]", "[7.9, 0.1, 2.4]": "[9.0, 0.1, 2.4]"})
     status, out, _ = run(capsys, "check", site)
     assert status == 2
     assert "error: station 'bs1' at (1.9, 1.9, 1) m lies inside the solid 'machine_1'; move it into free space" in out

@@ -15,6 +15,7 @@ from rayfix_offline.pathprior import PathPrior
 from rayfix_offline.pieces import Pieces, cut_pieces
 from rayfix_offline.rays import RaySet, sample_rays
 from rayfix_tables.angles import direction, tangent
+from tests.support.rays import no_reflections
 
 Launch = Callable[..., Segments]
 Groups = dict[tuple[int, int], tuple[float, NDArray[np.float64], NDArray[np.float64]]]
@@ -141,15 +142,8 @@ def test_the_mass_is_the_integral_of_the_window(window: float) -> None:
         mean=2.0 * one,
         variance=0.01 * one,
     )
-    sequences = Sequences(
-        images=np.zeros((1, 3)),
-        mirrors=np.eye(3)[None],
-        parents=np.array([-1], np.int32),
-        planes=np.array([-1], np.int32),
-        num_reflections=np.zeros(1, np.int8),
-    )
     centre = (0.4, 1.2)
-    ((mass, mean, cov),) = gather(Traced(rays, pieces, sequences), centre, window).values()
+    ((mass, mean, cov),) = gather(Traced(rays, pieces, no_reflections()), centre, window).values()
     inside = 1.0 - np.exp(-(CUTOFF**2) / 2.0)
     assert mass == pytest.approx(inside * np.exp(-(window**2) / 2.0), rel=0.01)
     # Of a Gaussian cut at radius c, the variance along either axis shrinks by c^2 / 2 exp(-c^2 / 2) / inside.

@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import Segments, Sequences
+from rayfix_offline.launch import Segments
 from rayfix_offline.pathprior import PathPrior, fill_path_prior
 from rayfix_offline.pieces import FIRST_NODE, Pieces, cut_pieces
 from rayfix_offline.rays import RaySet, sample_rays
 from rayfix_tables.freespace import FreeSpace
+from tests.support.rays import no_reflections
 
 Launch = Callable[..., Segments]
 Kind = Literal["power", "uniform", "paper"]
@@ -157,19 +158,12 @@ def test_pieces_lie_within_their_slice_and_their_segment(rays: RaySet, segments:
 def test_any_segment(start: float, span: float, ratio: float) -> None:
     """Segments that begin or end at, below or far beyond the first node, and tiny ones."""
     end = start + span
-    sequences = Sequences(
-        images=np.zeros((1, 3)),
-        mirrors=np.eye(3)[None],
-        parents=np.array([-1], np.int32),
-        planes=np.array([-1], np.int32),
-        num_reflections=np.zeros(1, np.int8),
-    )
     segments = Segments(
         sequence=np.zeros((1, 1), np.int32),
         start=np.array([[start]]),
         end=np.array([[end]]),
         log_gain=np.zeros((1, 1)),
-        sequences=sequences,
+        sequences=no_reflections(),
         lost_ray_share=0.0,
     )
     rays = sample_rays(0.5, np.random.default_rng(0))

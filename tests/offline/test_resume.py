@@ -17,6 +17,7 @@ from rayfix_tables.errors import BuildError
 from rayfix_tables.site import NO_BIAS
 from rayfix_tables.table import Table
 from tests.support.rooms import room_with_crate
+from tests.support.sites import stations_text
 
 SITE = """\
 [site]
@@ -29,7 +30,6 @@ max_path_length_m = 20.0
 windows_deg = [6.0, 15.0]
 seed = {seed}
 """
-STATION = '[[stations]]\nid = "{id}"\nposition_m = [{x}, {y}, 2.5]\n'
 STATIONS = {"a": (0.4, 0.5), "b": (3.5, 0.6), "c": (2.0, 4.5)}
 
 
@@ -37,7 +37,7 @@ def write_site(folder: Path, stations: dict[str, tuple[float, float]], *, seed: 
     """Write a room of 4 x 5 x 3 m with a box of 1 x 1 m in it, ``box`` m high, and its site file."""
     folder.mkdir(exist_ok=True)
     room_with_crate(box).export(folder / "room.ply")
-    text = SITE.format(seed=seed) + "".join(STATION.format(id=i, x=x, y=y) for i, (x, y) in stations.items())
+    text = SITE.format(seed=seed) + stations_text({name: (x, y, 2.5) for name, (x, y) in stations.items()})
     (folder / "site.toml").write_text(text, encoding="utf-8")
     return folder / "site.toml"
 

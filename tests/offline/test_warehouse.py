@@ -10,6 +10,7 @@ from rayfix_offline.build import build_table
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin import Twin, prepare_twin, refuse_errors
 from rayfix_tables.table import Table
+from tests.support.sites import stations_text
 
 POSITIONS = [(-4.3, -9.9, 4.5), (6.5, -9.5, 4.5), (-4.3, 0.0, 5.0), (6.5, 0.0, 5.0), (-6.5, 9.5, 4.5), (6.5, 9.5, 4.0)]
 IN_A_RACK = (-6.0, 0.0, 4.0)
@@ -30,9 +31,7 @@ windows_deg = [7.5]
 @pytest.fixture(scope="module")
 def site_path(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Site file with six stations under the walls' tops."""
-    stations = "".join(
-        f'[[stations]]\nid = "bs{n}"\nposition_m = {list(position)}\n' for n, position in enumerate(POSITIONS, 1)
-    )
+    stations = stations_text({f"bs{n}": position for n, position in enumerate(POSITIONS, 1)})
     path = tmp_path_factory.mktemp("warehouse") / "site.toml"
     path.write_text(SITE.format(scene=shared_data / "warehouse" / "warehouse_collision.ply") + stations)
     return path

@@ -20,6 +20,7 @@ import trimesh
 
 from rayfix_offline.build import build_table
 from rayfix_tables.table import Table
+from tests.support.sites import stations_text
 
 STATIONS = {"a": (0.5, 0.6, 2.6), "b": (3.6, 0.4, 2.3), "c": (3.2, 4.5, 2.7)}
 UE = np.array([1.6, 3.4, 1.1])
@@ -32,11 +33,10 @@ def room_table(tmp_path_factory: pytest.TempPathFactory) -> Table:
     walls = trimesh.creation.box(bounds=[(0, 0, 0), (4, 5, 3)])
     walls.invert()
     (folder / "room.glb").write_bytes(trimesh.Scene(walls).export(file_type="glb"))
-    stations = "".join(f'[[stations]]\nid = "{name}"\nposition_m = {list(place)}\n' for name, place in STATIONS.items())
     (folder / "site.toml").write_text(
         '[site]\nname = "room"\nscene = "room.glb"\n'
         '[propagation]\nmax_reflections = 1\nmax_path_length_m = 12.0\npath_prior = "paper"\n'
-        f"[table]\nwindows_deg = [2.5]\n{stations}",
+        f"[table]\nwindows_deg = [2.5]\n{stations_text(STATIONS)}",
         encoding="utf-8",
     )
     build_table(folder / "site.toml", folder / "room.h5")

@@ -19,6 +19,7 @@ import trimesh
 
 from rayfix_offline.build import build_table
 from rayfix_tables.table import Table
+from tests.support.sites import stations_text
 
 STATIONS = {"a": (0.5, 0.6, 2.6), "b": (3.6, 0.4, 2.3), "c": (3.2, 4.5, 2.7)}
 
@@ -29,11 +30,10 @@ def build_room(folder: Path, names: str) -> Path:
     walls.invert()
     screen = trimesh.creation.box(bounds=[(1.9, 0, 0), (2.1, 3.5, 3)])
     (folder / "room.glb").write_bytes(trimesh.Scene([walls, screen]).export(file_type="glb"))
-    stations = "".join(f'[[stations]]\nid = "{name}"\nposition_m = {list(STATIONS[name])}\n' for name in names)
     (folder / "site.toml").write_text(
         '[site]\nname = "room"\nscene = "room.glb"\n'
         "[propagation]\nmax_reflections = 0\nmax_path_length_m = 12.0\n"
-        f"[table]\nwindows_deg = [2.5]\n{stations}",
+        f"[table]\nwindows_deg = [2.5]\n{stations_text({name: STATIONS[name] for name in names})}",
         encoding="utf-8",
     )
     table = folder / f"{names}.h5"

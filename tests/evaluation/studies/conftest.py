@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from tests.support.sites import stations_text
+
 _SITE = """
 [site]
 name = "room"
@@ -27,9 +29,6 @@ def room_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene.add_geometry(trimesh.creation.box(bounds=[(0, 0, 0), (5, 4, 2.8)]), geom_name="shell")
     scene.add_geometry(trimesh.creation.box(bounds=[(2.2, 1.0, 0), (2.8, 2.6, 2.0)]), geom_name="cupboard")
     (folder / "room.glb").write_bytes(scene.export(file_type="glb"))
-    stations = "".join(
-        f'[[stations]]\nid = "{name}"\nposition_m = {list(place)}\n' for name, place in _STATIONS.items()
-    )
     site = folder / "site.toml"
-    site.write_text(_SITE + stations, encoding="utf-8")
+    site.write_text(_SITE + stations_text(_STATIONS), encoding="utf-8")
     return site
