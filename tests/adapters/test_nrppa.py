@@ -235,10 +235,35 @@ def test_additional_paths_are_skipped_and_told(paths: str):
     assert "MultipleULAoA" in skipped.reason
 
 
-@pytest.mark.parametrize("los", [{"loS-NLoSIndicatorSoft": 3}, {"loS-NLoSIndicatorHard": "nlos"}])
-def test_line_of_sight_changes_nothing(los: dict[str, Any]):
-    plain = item({"uL-AngleOfArrival": aoa(412, 1035)})
-    assert parse_nrppa(message({**plain, "LoS-NLoSInformation": los})) == parse_nrppa(message(plain))
+@pytest.mark.parametrize(
+    ("los", "probability"),
+    [
+        ({"loS-NLoSIndicatorSoft": 0}, 0.0),
+        ({"loS-NLoSIndicatorSoft": 3}, 0.3),
+        ({"loS-NLoSIndicatorSoft": 10}, 1.0),
+        ({"loS-NLoSIndicatorHard": "nlos"}, 0.0),
+        ({"loS-NLoSIndicatorHard": "los"}, 1.0),
+    ],
+)
+@pytest.mark.parametrize(
+    "value",
+    [
+        {"uL-AngleOfArrival": aoa(412, 1035)},
+        {"MultipleULAoA": {"multipleULAoA": [{"uL-AoA": aoa(412, 1035)}, {"uL-AoA": aoa(900, 1035)}]}},
+        {"uL-RTOA": {"uLRTOAmeas": {"k0": 985025}}},
+    ],
+)
+def test_the_indicator_of_line_of_sight_is_of_all_measurements_of_its_item(
+    value: dict[str, Any], los: dict[str, Any], probability: float
+):
+    plain = parse_nrppa(message(item(value)))
+    adapted = parse_nrppa(message({**item(value), "LoS-NLoSInformation": los}))
+    assert adapted == plain  # which does not compare it
+    for before, after in zip(plain.report.measurements, adapted.report.measurements, strict=True):
+        assert isinstance(before, Angle | TimeOfArrival)
+        assert isinstance(after, Angle | TimeOfArrival)
+        assert before.los_probability is None
+        assert after.los_probability == probability
 
 
 def test_a_measurement_report_is_as_good():

@@ -22,7 +22,7 @@ from rayfix_service.fusion.report import (
     TimeOfArrival,
 )
 from rayfix_service.http.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
-from rayfix_service.wire import parse_report
+from rayfix_service.wire import InvalidReportError, parse_report
 from tests.support.measurements import AOA, PT, RSSI, TDOA, TOA, report_with
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
@@ -91,6 +91,20 @@ def test_every_kind_but_a_power_may_have_heavy_tails(base: str):
     found = only(report_with(document, error_model="heavy_tailed", tail_share=0.3, tail_scale=5)).error_model
     assert found == ErrorModel(tail_share=0.3, tail_scale=5.0)
     assert only(report_with(document, error_model="gaussian")) == only(report_with(document))
+
+
+@pytest.mark.parametrize("base", [AOA, PT, TOA])
+@pytest.mark.parametrize("probability", [0, 0.3, 1.0, None])
+def test_what_is_of_one_path_may_tell_of_sight(base: dict[str, Any], probability: float | None):
+    assert only(report_with(base)).los_probability is None
+    assert only(report_with(base, los_probability=probability)).los_probability == probability
+
+
+@pytest.mark.parametrize(("base", "value"), [(AOA, 1.01), (PT, -0.1), (TOA, "0.5"), (TDOA, 0.5), (RSSI, 0.5)])
+def test_other_words_of_sight_are_refused(base: dict[str, Any], value: object):
+    with pytest.raises(InvalidReportError) as caught:
+        parse_report(report_with(base, los_probability=value))
+    assert caught.value.path == ("measurements", 0, "los_probability")
 
 
 def test_what_may_be_left_out():

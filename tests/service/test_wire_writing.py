@@ -168,6 +168,7 @@ METRES = st.floats(1e-3, 1e6)
 ERROR_MODELS = st.one_of(
     st.just(ErrorModel()), st.builds(ErrorModel, tail_share=st.floats(1e-3, 0.5), tail_scale=st.floats(1.5, 20))
 )
+SIGHTS = st.none() | st.floats(0.0, 1.0)
 SINGLE_ANGLES = st.builds(
     Angle,
     station_id=STATIONS,
@@ -175,6 +176,7 @@ SINGLE_ANGLES = st.builds(
     azimuth_stdev=st.floats(1e-6, 6.0),
     frame=st.sampled_from(["scene", "lcs", "north"]),
     error_model=ERROR_MODELS,
+    los_probability=SIGHTS,
 )
 FULL_ANGLES = st.builds(
     Angle,
@@ -187,7 +189,14 @@ FULL_ANGLES = st.builds(
 )
 LENGTHS = st.one_of(
     *(
-        st.builds(kind, station_id=STATIONS, path_length=METRES, stdev=METRES, error_model=ERROR_MODELS)
+        st.builds(
+            kind,
+            station_id=STATIONS,
+            path_length=METRES,
+            stdev=METRES,
+            error_model=ERROR_MODELS,
+            los_probability=SIGHTS,
+        )
         for kind in (Range, TimeOfArrival)
     )
 )

@@ -42,7 +42,7 @@ MakeTable = Callable[..., Table]
 
 @dataclass(frozen=True, kw_only=True)
 class Tube:
-    """The line of sight from a station to a place, as a cell's one component, in the numbers of the table."""
+    """The line of sight from a station to a place, or a path said to be reflected, in the numbers of the table."""
 
     station_id: str
     cell: int
@@ -52,6 +52,7 @@ class Tube:
     x_mean: Array
     jacobian: Array
     x_cov: Array
+    num_reflections: int = 0
 
 
 def line_of_sight(
@@ -100,7 +101,7 @@ def station_content(tubes: list[Tube]) -> StationContent:
             x_mean=np.array([tube.x_mean for tube in tubes]),
             jacobian=np.array([tube.jacobian for tube in tubes]),
             x_cov=pack(np.array([tube.x_cov for tube in tubes])),
-            num_reflections=np.zeros(len(tubes), np.int8),
+            num_reflections=np.array([tube.num_reflections for tube in tubes], np.int8),
         )
     level = Level(window=WINDOW, grid=GRID, cell_offsets=offsets, cell_log_mass=masses, mixture=mixture)
     return StationContent(levels=(level,), lost_ray_share=0.0, coverage=(1.0,))

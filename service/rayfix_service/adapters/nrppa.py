@@ -13,6 +13,7 @@ from rayfix_service.adapters.nrppa_documents import (
     AngleQuality,
     GnbRxTx,
     LcsToGcs,
+    LosInformation,
     LppTimingQuality,
     NrppaDocument,
     ResultItem,
@@ -77,7 +78,7 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
                 if isinstance(outcome, str):
                     skipped.append(Skipped(path=(*path, *place), reason=outcome))
                 else:
-                    measurements.append(((*path, *place), outcome))
+                    measurements.append(((*path, *place), _with_sight(outcome, item.los)))
     return adapted_report(
         measurements,
         skipped,
@@ -95,7 +96,7 @@ class _Converter:
     trp_id: int
     station_id: str
 
-    def convert(self, item: ResultItem) -> Iterator[tuple[Path, Measurement | str]]:
+    def convert(self, item: ResultItem) -> Iterator[tuple[Path, Angle | Range | TimeOfArrival | str]]:
         """Convert one item, which may hold several measurements or none."""
         name, value = one_of(item.value)
         path: Path = ("measuredResultsValue", name)
@@ -192,6 +193,14 @@ def _additional_paths(path: Path, value: UlRtoa | GnbRxTx) -> Iterator[tuple[Pat
         yield (*path, "additionalPathList"), _MORE_PATHS
     if value.more_paths is not None:
         yield (*path, "ExtendedAdditionalPathList"), _MORE_PATHS
+
+
+def _with_sight(measurement: Angle | Range | TimeOfArrival, los: LosInformation | None) -> Measurement:
+    """Add what the TRP says of a direct path; a hard indicator is a sure one."""
+    if los is None:
+        return measurement
+    name, value = one_of(los)
+    return replace(measurement, los_probability=value / 10.0 if name.endswith("Soft") else float(value == "los"))
 
 
 def _steps(quality: int) -> float:

@@ -17,6 +17,7 @@ from rayfix_service.fusion.lookup import Direction
 from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.fusion.sight import sight
 
 _ANY_LENGTH = Term(0.0, 0.0, math.inf)
 """Likelihood of a path length that was not measured."""
@@ -64,7 +65,10 @@ def make_factor(
     log_any_time = -sum(math.log(max_path_length + math.sqrt(2.0 * math.pi * v)) for v in _variances(observation))
     log_good, log_bad = math.log1p(-settings.outlier_probability), math.log(settings.outlier_probability)
     log_outlier = log_bad + log_any_time - _log_angle_range(observation)
-    heard = [station.towards(_widened(observation.direction, spread.scale)) for spread in observation.angle_spreads]
+    said = observation.los_probability
+    seen = None if said is None else sight(said, settings.sight_error)
+    directions = (_widened(observation.direction, spread.scale) for spread in observation.angle_spreads)
+    heard = [station.towards(direction, seen) for direction in directions]
     bounds = [0, *itertools.accumulate(len(gaussians) for gaussians in heard)]
     if bounds[-1] == 0:
         return None

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rayfix_service.fusion.kernels import condition_on_angle
 from rayfix_service.fusion.lookup import NO_DIRECTION, Direction, Lookup, look_up
 from rayfix_service.fusion.merging import merge_gaussians
+from rayfix_service.fusion.sight import Sight, is_direct
 from rayfix_tables.table import StationPart
 
 _RANGE_STDEV = 0.1
@@ -39,6 +40,18 @@ class Heard(NamedTuple):
         """Return the number of Gaussians."""
         return len(self.log_evidence)
 
+    def those(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> "Heard":
+        """Gaussians that an index picks."""
+        return Heard(*(array[index] for array in self))
+
+    def weighed(self, log_weight: NDArray[np.float64] | float) -> "Heard":
+        """Give them more weight, by its logarithm."""
+        return Heard(self.log_evidence + log_weight, self.mean, self.cov)
+
+    def merged(self) -> "Heard":
+        """Merge in place those that no path length tells apart."""
+        return self.those(merge_gaussians(*self, (0.0, 0.0, 0.0, _RANGE_STDEV**2), _MAX_DIVERGENCE))
+
 
 def join(parts: Sequence[Heard]) -> Heard:
     """Gaussians of all parts."""
@@ -51,18 +64,33 @@ class HeardStation:
 
     part: StationPart
 
-    def towards(self, measured: Direction) -> Heard:
-        """Gaussians of the paths from a measured direction; none where no ray comes."""
-        if measured.azimuth is None and measured.zenith is None:
-            return self.everywhere
-        return _condition(look_up(self.part.levels, measured))
+    def towards(self, measured: Direction, sight: Sight | None = None) -> Heard:
+        """Gaussians of the paths from a measured direction; none where no ray comes.
+
+        Parameters
+        ----------
+        sight : Sight, optional
+            What the weights of direct and of reflected paths are multiplied by.
+        """
+        anywhere = measured.azimuth is None and measured.zenith is None
+        if sight is None:
+            return self.everywhere if anywhere else _condition(look_up(self.part.levels, measured))
+        if anywhere:
+            return join([heard.weighed(log) for heard, log in zip(self.everywhere_by_sight, sight, strict=True)])
+        lookup = look_up(self.part.levels, measured)
+        return _condition(lookup).weighed(np.where(is_direct(lookup), *sight))
 
     @cached_property
     def everywhere(self) -> Heard:
         """Gaussians of the paths of all directions, those merged that no path length tells apart."""
-        heard = _condition(look_up(self.part.levels, NO_DIRECTION))
-        left = merge_gaussians(*heard, (0.0, 0.0, 0.0, _RANGE_STDEV**2), _MAX_DIVERGENCE)
-        return Heard(*(array[left] for array in heard))
+        return _condition(look_up(self.part.levels, NO_DIRECTION)).merged()
+
+    @cached_property
+    def everywhere_by_sight(self) -> tuple[Heard, Heard]:
+        """Direct paths and reflected ones of all directions, either merged like :attr:`everywhere`."""
+        lookup = look_up(self.part.levels, NO_DIRECTION)
+        heard, direct = _condition(lookup), is_direct(lookup)
+        return heard.those(direct).merged(), heard.those(~direct).merged()
 
 
 def _condition(lookup: Lookup) -> Heard:

@@ -18,6 +18,7 @@ from rayfix_service.fusion.report import (
     TimeDifference,
     TimeOfArrival,
 )
+from rayfix_service.fusion.sight import los_probability
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import NO_BIAS, SiteInfo, Station
 
@@ -44,6 +45,8 @@ class Observation:
         Places of the other measurements in the report.
     differences : tuple of int
         Places of the time differences to which the path's arrival belongs; each belongs to two.
+    los_probability : float or None
+        That the path is direct, in the receiver's judgement.
     """
 
     station_id: str
@@ -55,6 +58,7 @@ class Observation:
     angle_index: int | None = None
     timing_indices: tuple[int, ...] = ()
     differences: tuple[int, ...] = ()
+    los_probability: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,7 +155,15 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
     for arrival, reading in read.readings:
         drafts[arrival.station_id].readings.append((arrival, reading))
     observations = [observation for draft in drafts.values() for observation in _observations(draft)]
+    if los_probability(report.measurements) is not None:
+        observations = [_with_sight(observation, report) for observation in observations]
     return SortedReport(observations=tuple(observations), num_clocks=read.num_clocks, unused={**unused, **read.unused})
+
+
+def _with_sight(observation: Observation, report: Report) -> Observation:
+    places = (observation.angle_index, *observation.timing_indices)
+    said = los_probability(report.measurements[place] for place in places if place is not None)
+    return replace(observation, los_probability=said)
 
 
 def _unbiased(arrival: Arrival, station: Station) -> Arrival:

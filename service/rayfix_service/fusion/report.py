@@ -3,7 +3,7 @@
 The JSON of the HTTP interface is another matter: :mod:`rayfix_service.wire` turns it into these and back.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -73,6 +73,9 @@ class Angle:
     frame : {"scene", "lcs", "north"}
         Frame in which the angles are given.
     error_model : ErrorModel
+    los_probability : float, optional
+        Probability, between 0 and 1, that the path is direct, in the receiver's judgement of the signal's shape. Two
+        measurements that differ in nothing else are the same one.
     """
 
     station_id: str
@@ -83,6 +86,7 @@ class Angle:
     correlation: float = 0.0
     frame: Frame = "scene"
     error_model: ErrorModel = GAUSSIAN
+    los_probability: float | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +97,7 @@ class Range:
     path_length: float
     stdev: float
     error_model: ErrorModel = GAUSSIAN
+    los_probability: float | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +125,7 @@ class TimeOfArrival:
     path_length: float
     stdev: float
     error_model: ErrorModel = GAUSSIAN
+    los_probability: float | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, kw_only=True)

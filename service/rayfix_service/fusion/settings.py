@@ -11,6 +11,8 @@ class FusionSettings:
     ----------
     outlier_probability : float
         Prior probability that a measurement has nothing to do with the position.
+    sight_error : float
+        Least probability that a receiver's judgement whether a path is direct is wrong, however sure it seems.
     beam_width : int
         Hypotheses that are kept from one station to the next, before the like are merged.
     max_divergence : float
@@ -29,6 +31,7 @@ class FusionSettings:
     """
 
     outlier_probability: float = 0.01
+    sight_error: float = 0.05
     beam_width: int = 2048
     max_divergence: float = 5e-3
     component_floor: float = 1e-6

@@ -110,5 +110,9 @@ Confidence = Annotated[
     float, _number(0.01, 0.99, "the probability with which the accuracies of the answer are to hold")
 ]
 
+LosProbability = Annotated[
+    float, _number(0, 1, "the probability that the path is direct, in the receiver's judgement of the signal's shape")
+]
+
 TailShare = Annotated[float, _number(1e-3, 0.5, "the share of errors that are of the wide part")]
 TailScale = Annotated[float, _number(1.5, 20, "how many times wider the wide part is")]

@@ -27,6 +27,7 @@ from rayfix_service.wire.fields import (
     DepartureNs,
     DifferenceM,
     DifferenceNs,
+    LosProbability,
     PathLossExponent,
     PowerDbm,
     RangeM,
@@ -72,7 +73,13 @@ class _WithErrorModel(WireModel):
         )
 
 
-class AngleDocument(_WithErrorModel):
+class _OfOnePath(_WithErrorModel):
+    """Measurement of which the receiver may tell whether the path is direct."""
+
+    los_probability: LosProbability | None = None
+
+
+class AngleDocument(_OfOnePath):
     """An angle of arrival: the direction from the station towards the incoming ray."""
 
     model_config = ConfigDict(
@@ -118,6 +125,7 @@ class AngleDocument(_WithErrorModel):
             correlation=self.correlation or 0.0,
             frame=self.frame,
             error_model=self._error_model(),
+            los_probability=self.los_probability,
         )
 
 
@@ -166,7 +174,7 @@ def _length(document: WireModel, forms: _Forms) -> tuple[float, float]:
     return METRES_PER_NANOSECOND * (values[0] - (values[1] if len(values) > 1 else 0.0)), stdev
 
 
-class RangeDocument(_WithErrorModel):
+class RangeDocument(_OfOnePath):
     """A propagation time: a path length, a delay, arrival and departure, or a round trip and the time of the reply."""
 
     model_config = ConfigDict(title="PropagationTime", json_schema_extra=_RANGE_FORMS.schema)
@@ -192,14 +200,20 @@ class RangeDocument(_WithErrorModel):
     def measurement(self) -> Range:
         """Convert to metres."""
         length, stdev = _length(self, _RANGE_FORMS)
-        return Range(station_id=self.station_id, path_length=length, stdev=stdev, error_model=self._error_model())
+        return Range(
+            station_id=self.station_id,
+            path_length=length,
+            stdev=stdev,
+            error_model=self._error_model(),
+            los_probability=self.los_probability,
+        )
 
 
 _LONGEST = 1e6
 """No difference of times is of a longer path, m."""
 
 
-class TimeOfArrivalDocument(_WithErrorModel):
+class TimeOfArrivalDocument(_OfOnePath):
     """A time of arrival, with an unknown clock offset that all of a report's times of arrival share."""
 
     model_config = ConfigDict(title="TimeOfArrival", json_schema_extra=_ARRIVAL_FORMS.schema)
@@ -220,7 +234,11 @@ class TimeOfArrivalDocument(_WithErrorModel):
         """Convert to metres."""
         length, stdev = _length(self, _ARRIVAL_FORMS)
         return TimeOfArrival(
-            station_id=self.station_id, path_length=length, stdev=stdev, error_model=self._error_model()
+            station_id=self.station_id,
+            path_length=length,
+            stdev=stdev,
+            error_model=self._error_model(),
+            los_probability=self.los_probability,
         )
 
 

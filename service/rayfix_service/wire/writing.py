@@ -39,11 +39,11 @@ def report_to_document(report: Report) -> dict[str, Any]:
 def _measurement(measurement: Measurement) -> dict[str, Any]:
     match measurement:
         case Angle():
-            return _angle(measurement)
+            return _angle(measurement) | _sight(measurement)
         case LogRange():
             return _signal_strength(measurement)
         case TimeDifference():
-            document = {
+            document: dict[str, Any] = {
                 "type": "tdoa",
                 "station_id": measurement.station_id,
                 "reference_station_id": measurement.reference_station_id,
@@ -54,6 +54,7 @@ def _measurement(measurement: Measurement) -> dict[str, Any]:
                 "type": "pt" if isinstance(measurement, Range) else "toa",
                 "station_id": measurement.station_id,
                 "range_m": measurement.path_length,
+                **_sight(measurement),
             }
     return {**document, "stdev_m": measurement.stdev, **_error_model(measurement.error_model)}
 
@@ -94,6 +95,10 @@ def _error_model(model: ErrorModel) -> dict[str, Any]:
     if model == GAUSSIAN:
         return {}
     return {"error_model": "heavy_tailed", "tail_share": model.tail_share, "tail_scale": model.tail_scale}
+
+
+def _sight(measurement: Angle | Range | TimeOfArrival) -> dict[str, Any]:
+    return {} if measurement.los_probability is None else {"los_probability": measurement.los_probability}
 
 
 def _degrees(radians: float) -> float:

@@ -1,0 +1,56 @@
+"""What a receiver's own judgement whether a path is direct says of the paths of the table.
+
+Some receivers tell, from the shape of the signal, how probable it is that it came straight. The shape is evidence
+beside angle and time, and the judgement is meant for even odds beforehand: a probability p multiplies the odds of a
+direct path by p / (1 - p), whatever the table and the other stations make them. Components of direct paths get 2 p,
+those of reflected ones 2 (1 - p), so that 1/2 changes nothing, not even the evidence; where the measurement has nothing
+to do with the position, neither has the judgement. (J. Pearl, Probabilistic Reasoning in Intelligent Systems, 1988,
+calls it virtual evidence.)
+"""
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.lookup import Lookup
+from rayfix_service.fusion.report import Angle, Measurement, Range, TimeOfArrival
+
+
+class Sight(NamedTuple):
+    """Logarithms of what the weights of direct and of reflected paths are multiplied by."""
+
+    log_direct: float
+    log_reflected: float
+
+
+def sight(los_probability: float, least_error: float) -> Sight:
+    """Weigh a judgement that is wrong with a probability of ``least_error`` at least, however sure it seems."""
+    probability = min(max(los_probability, least_error), 1.0 - least_error)
+    return Sight(math.log(2.0 * probability), math.log(2.0 * (1.0 - probability)))
+
+
+def los_probability(measurements: Iterable[Measurement]) -> float | None:
+    """Mean of what the measurements of one path say of it, None where they say nothing.
+
+    They are of one signal, so that its shape must not count once for each of them.
+    """
+    said = [
+        m.los_probability
+        for m in measurements
+        if isinstance(m, Angle | Range | TimeOfArrival) and m.los_probability is not None
+    ]
+    return sum(said) / len(said) if said else None
+
+
+def is_direct(lookup: Lookup) -> NDArray[np.bool_]:
+    """Tell which components of the cells of a lookup, cell after cell, are of paths without a reflection.
+
+    A component of several paths counts as the one that carries most of it.
+    """
+    offsets = lookup.level.cell_offsets
+    begins, counts = offsets[lookup.cells], offsets[lookup.cells + 1] - offsets[lookup.cells]
+    places = np.repeat(begins - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
+    return np.asarray(lookup.level.mixture.num_reflections[places] == 0)
