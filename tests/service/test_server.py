@@ -18,7 +18,7 @@ import pytest
 
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE
-from rayfix_service.http.server import SERVICE_VARIABLE, app_from_environment, check_address, is_loopback, serve
+from rayfix_service.http.server import check_address, is_loopback, serve
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_tables.errors import NotATableError, TableError
 from tests.support.reports import REPORT
@@ -187,9 +187,6 @@ def test_what_cannot_be_served_is_said_first(hall_table_path: Path, tmp_path: Pa
     with pytest.raises(ServiceError, match=r"No space left on device.*make room"):
         serve(hall_table_path, port=0)
     assert {path.name for path in tmp_path.iterdir()} == {"empty", "wrong"}
-    monkeypatch.delenv(SERVICE_VARIABLE, raising=False)
-    with pytest.raises(ServiceError, match=SERVICE_VARIABLE):
-        app_from_environment()
 
 
 def test_a_free_port_is_free_again_after_the_check():

@@ -31,7 +31,7 @@ from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.short_way import ShortWay
 from rayfix_service.http.slow_fixes import SlowFixes
 from rayfix_service.http.stopping import on_stop_signal
-from rayfix_service.http.tables import Tables
+from rayfix_service.http.tables import ServedTable, Tables
 from rayfix_service.web import routes_assets, routes_scene, routes_simulation
 from rayfix_service.web.documents import SimulationRequest
 from rayfix_service.web.per_table import PerTable
@@ -73,7 +73,12 @@ class RayfixApp(FastAPI):
         return self.openapi_schema
 
 
-def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> FastAPI:
+def create_app(
+    tables_path: Path,
+    settings: ServiceSettings | None = None,
+    *,
+    at_hand: dict[str, ServedTable] | None = None,
+) -> FastAPI:
     """Make the web application that answers from one table or several.
 
     It listens at once; ``/livez`` answers. Meanwhile a thread verifies the tables and compiles the kernels; then
@@ -84,6 +89,8 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
     tables_path : pathlib.Path
         The table, or a folder of tables. One that does not pass its check leaves the application not ready.
     settings : ServiceSettings, optional
+    at_hand : dict of str to ServedTable, optional
+        Tables that are verified already, by name; they answer at once. The application takes them out.
 
     Raises
     ------
@@ -95,7 +102,9 @@ def create_app(tables_path: Path, settings: ServiceSettings | None = None) -> Fa
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         state = app.state
-        state.tables = tables = Tables(tables_path, state.metrics, runtime_folder=settings.runtime_folder)
+        state.tables = tables = Tables(
+            tables_path, state.metrics, runtime_folder=settings.runtime_folder, at_hand=at_hand
+        )
         keeping = [asyncio.create_task(tables.keep(settings.watch_seconds))]
         if keys is not None:
             keeping.append(asyncio.create_task(_keep_keys(keys, settings.watch_seconds)))

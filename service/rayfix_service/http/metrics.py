@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import get_args
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, values
 from prometheus_client.exposition import choose_encoder
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 
@@ -145,6 +145,14 @@ class Metrics:
 
 def _table_labels(name: str, table: Table) -> tuple[str, ...]:
     return (name, table.table_id, table.site.name, str(table.format_version), table.software_version)
+
+
+def share_figures() -> None:
+    """Keep figures that are made from now on where ``MULTIPROCESS_VARIABLE`` says, in files of this process.
+
+    prometheus-client looks whether it is set when it is imported, which is before there are workers.
+    """
+    values.ValueClass = values.get_value_class()  # type: ignore[no-untyped-call]
 
 
 def forget_dead_workers() -> None:

@@ -1,34 +1,35 @@
 """Serve tables over HTTP."""
 
+import gc
 import ipaddress
+import logging
 import os
 import socket
+import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import NamedTemporaryFile, TemporaryDirectory
 
 import uvicorn
-from fastapi import FastAPI
-from pydantic import TypeAdapter
 
 from rayfix_service.http.app import create_app
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.keys import read_key_file
 from rayfix_service.http.logs import LogFormat, log_config
-from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE
+from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE, share_figures
 from rayfix_service.http.settings import ServiceSettings
-from rayfix_service.http.tables import TableFiles
-from rayfix_tables.table import Table
-
-SERVICE_VARIABLE = "RAYFIX_SERVICE"
-"""Environment variable that tells worker processes what to serve, as JSON."""
+from rayfix_service.http.tables import forget_changed, load_tables
+from rayfix_service.http.workers import COULD_NOT_START, run_workers
+from rayfix_tables.errors import RayfixError
 
 _MAX_MESSAGE = 16 << 20  # bytes; up to here a message that is too long is answered, beyond it ends the connection
-_HANGING_SECONDS = 30  # a worker that is silent for so long is replaced; a kernel may keep it silent for some
 _FIGURES_BYTES = 8 << 20  # of some workers
 _SHUTDOWN_SECONDS = 10  # for requests under way; a full batch takes about one
+
+_log = logging.getLogger(__name__)
 
 
 def serve(
@@ -52,7 +53,7 @@ def serve(
     port : int
         TCP port; 0 takes a free one, which the log names.
     workers : int
-        Processes that share the port and, since they map it, the memory of the table.
+        Processes that share the port and, since they are forked once the tables are loaded, most of their memory.
     log_format : {"text", "json"}
         JSON is an object a line.
     access_log : bool
@@ -71,8 +72,6 @@ def serve(
     settings = replace(settings or ServiceSettings(), own_process=True)
     if workers < 1:
         raise ServiceError(f"workers is {workers}; give at least 1")
-    for table_path in TableFiles(path=path).find().values():
-        Table.open(table_path).verify()
     if settings.api_keys is not None:
         read_key_file(settings.api_keys)
     elif not is_loopback(host):
@@ -82,55 +81,49 @@ def serve(
         )
     check_address(host, port)
     with ExitStack() as stack:
-        app: str | FastAPI
         if workers > 1:
             settings = replace(settings, runtime_folder=stack.enter_context(_runtime_folder()))
-            stack.enter_context(_environment(SERVICE_VARIABLE, _Service(path, settings).to_json()))
-            app = f"{__name__}:{app_from_environment.__name__}"
-        else:
-            app = create_app(path, settings)
         if MULTIPROCESS_VARIABLE in os.environ:
             _check_room(Path(os.environ[MULTIPROCESS_VARIABLE]))
-        uvicorn.run(
-            app,
-            factory=workers > 1,
+        at_hand = load_tables(path)
+        config = uvicorn.Config(
+            partial(create_app, path, settings, at_hand=at_hand),
+            factory=True,
             host=host,
             port=port,
-            workers=workers,
             ws_max_size=_MAX_MESSAGE,
             ws_per_message_deflate=False,  # costs more than it saves, on messages of a kilobyte
             timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
             server_header=False,
-            timeout_worker_healthcheck=_HANGING_SECONDS,
             access_log=False,  # this package has one of its own
             log_config=log_config(log_format, access_log=access_log),
         )
+        if workers == 1:
+            with suppress(KeyboardInterrupt):
+                _run(config)
+            return
+        gc.collect()
+        gc.freeze()  # a collection would write to what the workers share, and so copy it
+        with config.bind_socket() as bound:
+            run_workers(partial(_work, config, bound), count=workers, meanwhile=partial(forget_changed, at_hand))
 
 
-@dataclass(frozen=True)
-class _Service:
-    """What a worker process must know."""
+def _work(config: uvicorn.Config, bound: socket.socket) -> None:
+    """Be one of several processes that answer at an address."""
+    share_figures()
+    try:
+        _run(config, bound)
+    except RayfixError as error:
+        _log.critical("a worker cannot start: %s", error)
+        sys.exit(COULD_NOT_START)
 
-    tables_path: Path
-    settings: ServiceSettings
 
-    def to_json(self) -> str:
-        return TypeAdapter(_Service).dump_json(self).decode()
-
-
-def app_from_environment() -> FastAPI:
-    """Make the application in a worker process, of what the environment says.
-
-    Raises
-    ------
-    ServiceError
-        When it says nothing.
-    """
-    text = os.environ.get(SERVICE_VARIABLE)
-    if not text:
-        raise ServiceError(f"the environment variable {SERVICE_VARIABLE} is not set; start workers by serve()")
-    service = TypeAdapter(_Service).validate_json(text)
-    return create_app(service.tables_path, service.settings)
+def _run(config: uvicorn.Config, *bound: socket.socket) -> None:
+    """Answer requests until the process is told to end."""
+    server = uvicorn.Server(config)
+    server.run(list(bound) or None)
+    if not server.started:
+        sys.exit(COULD_NOT_START)
 
 
 @contextmanager
@@ -146,18 +139,9 @@ def _runtime_folder() -> Iterator[Path]:
         if MULTIPROCESS_VARIABLE not in os.environ:
             # Whichever worker is asked answers for all.
             (Path(name) / "metrics").mkdir()
-            stack.enter_context(_environment(MULTIPROCESS_VARIABLE, str(Path(name) / "metrics")))
+            os.environ[MULTIPROCESS_VARIABLE] = str(Path(name) / "metrics")
+            stack.callback(os.environ.pop, MULTIPROCESS_VARIABLE)
         yield Path(name)
-
-
-@contextmanager
-def _environment(variable: str, value: str) -> Iterator[None]:
-    """Set an environment variable for a while."""
-    os.environ[variable] = value
-    try:
-        yield
-    finally:
-        del os.environ[variable]
 
 
 def _check_room(folder: Path) -> None:

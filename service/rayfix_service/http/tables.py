@@ -118,6 +118,24 @@ def load_table(name: str, path: Path) -> ServedTable:
     return ServedTable(name=name, locator=locator, tracker=tracker, state=state)
 
 
+def load_tables(path: Path) -> dict[str, ServedTable]:
+    """Load a table, or all tables of a folder, by name.
+
+    Raises
+    ------
+    TableError
+        When one of the files is no whole table, or a folder has none.
+    """
+    return {name: load_table(name, file) for name, file in TableFiles(path=path).find().items()}
+
+
+def forget_changed(tables: dict[str, ServedTable]) -> None:
+    """Take out the tables whose files are no longer those that they were read from."""
+    for name, served in list(tables.items()):
+        if file_state(served.locator.table.path) != served.state:
+            del tables[name]
+
+
 class Tables:
     """The tables of one process.
 
@@ -131,13 +149,24 @@ class Tables:
     metrics : Metrics
     runtime_folder : pathlib.Path, optional
         Folder through which the workers of one service tell each other to look at all files.
+    at_hand : dict of str to ServedTable, optional
+        Tables that are loaded already, by name. One whose file has not changed since is served at once. Each is taken
+        out, so that nothing holds it when it is swapped.
     """
 
-    def __init__(self, path: Path, metrics: Metrics, *, runtime_folder: Path | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        metrics: Metrics,
+        *,
+        runtime_folder: Path | None = None,
+        at_hand: dict[str, ServedTable] | None = None,
+    ) -> None:
         self._files = TableFiles(path=path)
         self._metrics = metrics
         self._marker = None if runtime_folder is None else runtime_folder / "reload"
         self._marked: FileState = None if self._marker is None else file_state(self._marker)
+        self._at_hand = {} if at_hand is None else at_hand
         self._served: Mapping[str, ServedTable] = {}
         self._refused: dict[str, FileState] = {}
         self._looked_at: dict[str, FileState] = {}
@@ -274,7 +303,9 @@ class Tables:
         if not again and name in self._refused and self._refused[name] == state:
             return TableChange(name=name, change="unchanged")
         try:
-            table = await asyncio.to_thread(load_table, name, path)
+            table = self._at_hand.pop(name, None)
+            if table is None or table.state != state:
+                table = await asyncio.to_thread(load_table, name, path)
         except Exception as error:
             return self._refuse(name, path, state, error)
         self._refused.pop(name, None)
