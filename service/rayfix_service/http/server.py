@@ -1,5 +1,6 @@
 """Serve tables over HTTP."""
 
+import asyncio
 import gc
 import ipaddress
 import logging
@@ -28,6 +29,7 @@ from rayfix_tables.errors import RayfixError
 _MAX_MESSAGE = 16 << 20  # bytes; up to here a message that is too long is answered, beyond it ends the connection
 _FIGURES_BYTES = 8 << 20  # of some workers
 _SHUTDOWN_SECONDS = 10  # for requests under way; a full batch takes about one
+_ARRIVING_SECONDS = 0.2  # for requests that are on the way to this process when it is told to end
 
 _log = logging.getLogger(__name__)
 
@@ -105,7 +107,12 @@ def serve(
         gc.collect()
         gc.freeze()  # a collection would write to what the workers share, and so copy it
         with config.bind_socket() as bound:
-            run_workers(partial(_work, config, bound), count=workers, meanwhile=partial(forget_changed, at_hand))
+            run_workers(
+                partial(_work, config, bound),
+                count=workers,
+                meanwhile=partial(forget_changed, at_hand),
+                ending=bound.close,  # or the system would take connections that nobody answers
+            )
 
 
 def _work(config: uvicorn.Config, bound: socket.socket) -> None:
@@ -120,10 +127,22 @@ def _work(config: uvicorn.Config, bound: socket.socket) -> None:
 
 def _run(config: uvicorn.Config, *bound: socket.socket) -> None:
     """Answer requests until the process is told to end."""
-    server = uvicorn.Server(config)
+    server = _Server(config)
     server.run(list(bound) or None)
     if not server.started:
         sys.exit(COULD_NOT_START)
+
+
+class _Server(uvicorn.Server):
+    """A server that answers what was sent before it was told to end.
+
+    Such a request may wait in a connection that is not yet accepted or read, and uvicorn would close that.
+    """
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Take what has arrived, then stop listening and finish what is under way."""
+        await asyncio.sleep(_ARRIVING_SECONDS)
+        await super().shutdown(sockets)
 
 
 @contextmanager

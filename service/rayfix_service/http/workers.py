@@ -23,7 +23,9 @@ _FORK = multiprocessing.get_context("fork")
 _log = logging.getLogger(__name__)
 
 
-def run_workers(work: Callable[[], None], *, count: int, meanwhile: Callable[[], None]) -> None:
+def run_workers(
+    work: Callable[[], None], *, count: int, meanwhile: Callable[[], None], ending: Callable[[], object]
+) -> None:
     """Run worker processes until this process is told to end (SIGINT, SIGTERM), then have them end.
 
     Workers have all that this process has: its memory is theirs until either writes to it. It must have no other
@@ -36,6 +38,8 @@ def run_workers(work: Callable[[], None], *, count: int, meanwhile: Callable[[],
     count : int
     meanwhile : callable
         What this process does at each look at them, twice a second.
+    ending : callable
+        What it does when it has told them to end.
 
     Raises
     ------
@@ -54,6 +58,7 @@ def run_workers(work: Callable[[], None], *, count: int, meanwhile: Callable[[],
     finally:
         for worker in workers:
             worker.process.terminate()
+        ending()
         deadline = time.monotonic() + _ENDING_SECONDS
         for worker in workers:
             worker.process.join(max(deadline - time.monotonic(), 0))
