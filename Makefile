@@ -46,11 +46,12 @@ lint: $(VENV)/.done
 types: $(VENV)/.done
 	$(BIN)/mypy
 
-# The wheel, in an environment of its own and outside the checkout, runs the demo.
+# The wheel, in an environment of its own and outside the checkout, runs the demo. What the service needs has wheels for arm64.
 package: $(VENV)/.done viewer
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
 	$(BIN)/python tests/package/check_wheel.py dist
+	$(BIN)/python docker/check_wheels.py
 
 # The images, built and run without a container engine: as root, with buildah and debootstrap.
 images: $(VENV)/.done viewer

@@ -1,7 +1,8 @@
 """What a service needs: processor time a fix, memory, time to start. docs/capacity.md plans with these figures.
 
 A real ``rayfix serve`` of one worker answers reports of uniform drops; its processor time is counted, not the wall
-clock, so that the figures hold on a machine that is busy with other work too. Run with ``--table`` on any table.
+clock, so that the figures hold on a machine that is busy with other work too; then one of several workers, whose memory
+is told. Run with ``--table`` on any table.
 """
 
 import http.client
@@ -33,6 +34,7 @@ CASES: list[tuple[str, float, Timing, bool]] = [
 ]
 """What is measured: label, deviation of angles [deg], times, and whether angles are."""
 
+WORKERS = 4
 CONNECTIONS = 16
 BATCH = 100
 
@@ -57,6 +59,12 @@ def main() -> None:
                 print(row(label, locator, server, port, documents), flush=True)
             memory = server.memory_full_info()
             print(f"after all: {memory.uss / 1e6:.0f} MB of its own, {(memory.rss - memory.uss) / 1e6:.0f} MB shared")
+        with serving(table.path, WORKERS) as (port, first, seconds, cpu):
+            print(f"{WORKERS} workers: start to ready {seconds:.1f} s, of which {cpu:.1f} s of processor time in all")
+            for _ in range(WORKERS):  # each worker comes by many of them
+                post_all(port, "/v1/positions", [json.dumps(d).encode() for own in reports.values() for d in own])
+            own = [worker.memory_full_info().uss / 1e6 for worker in first.children()]
+            print(f"after all: {', '.join(f'{size:.0f}' for size in sorted(own))} MB of their own")
 
 
 def simulate(drops: list[Drop], seed: int, degrees: float, timing: Timing, angles: bool) -> list[dict[str, Any]]:
@@ -93,8 +101,9 @@ def row(label: str, locator: Locator, server: psutil.Process, port: int, documen
 
 
 def processor_seconds(process: psutil.Process) -> float:
-    times = process.cpu_times()
-    return float(times.user + times.system)
+    """Return the processor time of a process and its children so far."""
+    times = [each.cpu_times() for each in (process, *process.children())]
+    return float(sum(time.user + time.system for time in times))
 
 
 def post_all(port: int, path: str, bodies: list[bytes]) -> None:
@@ -115,13 +124,13 @@ def post_all(port: int, path: str, bodies: list[bytes]) -> None:
 
 
 @contextmanager
-def serving(table_path: Path) -> Iterator[tuple[int, psutil.Process, float, float]]:
-    """Serve a table with one worker; yields port, process, and the start's seconds and processor seconds."""
+def serving(table_path: Path, workers: int = 1) -> Iterator[tuple[int, psutil.Process, float, float]]:
+    """Serve a table; yields port, the first process, and the start's seconds and processor seconds."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     begin = time.perf_counter()
-    command = [sys.executable, "-m", "rayfix", "serve", str(table_path), "--port", str(port)]
+    command = [sys.executable, "-m", "rayfix", "serve", str(table_path), "--port", str(port), "--workers", str(workers)]
     with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
         try:
             while not ready(port):

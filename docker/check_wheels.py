@@ -1,7 +1,7 @@
 """List what the service needs that has no wheel for a processor: ``check_wheels.py [--machine aarch64]``.
 
 pip resolves the service's requirements for this machine, then looks for a wheel of each for the other. Nothing is
-installed, and only metadata is fetched. Ends with status 1 when anything is missing.
+installed, and only metadata is fetched. Ends with status 1 when anything is missing. ``make package`` calls this.
 """
 
 import argparse
@@ -28,8 +28,8 @@ def main() -> None:
     needed = resolve(requirements(ROOT / "pyproject.toml", options.extras))
     target = ["--only-binary=:all:", "--python-version", options.python, "--implementation", "cp"]
     target += [f"--platform=manylinux_2_{minor}_{options.machine}" for minor in GLIBC]
-    missing = [name for name in needed if resolve([name], "--no-deps", *target) is None]
-    if missing:
+    if resolve(needed, "--no-deps", *target) is None:
+        missing = [name for name in needed if resolve([name], "--no-deps", *target) is None]
         sys.exit(f"no wheel for {options.machine} and Python {options.python}: {', '.join(missing)}")
     print(f"all {len(needed)} have a wheel for {options.machine} and Python {options.python}: {', '.join(needed)}")
 

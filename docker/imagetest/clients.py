@@ -42,7 +42,7 @@ class Load:
     answered_after: int = 0
     """Requests that were sent before the service was told to end, and answered after."""
     turned_away: int = 0
-    """Connections made after that: refused, or reset by the system, which had taken them for a server that ended."""
+    """Requests that were sent whole only after that, and refused, or reset for want of a server."""
     failed: list[str] = field(default_factory=list)
     ending: float = float("inf")
     """When the service was told to end."""
@@ -58,21 +58,22 @@ class Load:
             with self._lock:
                 self.turned_away += 1
             return False
-        begin = time.monotonic()
+        sent = float("inf")
         try:
             headers = {"content-type": "application/json", "connection": "close", **headers}
             connection.request("POST", path, body, headers)
+            sent = time.monotonic()
             answer = connection.getresponse()
             answer.read()
             with self._lock:
                 if answer.status == 200:
                     self.answered += 1
-                    self.answered_after += begin < self.ending < time.monotonic()
+                    self.answered_after += sent < self.ending < time.monotonic()
                 else:
                     self.failed.append(f"{path}: status {answer.status}")
         except (OSError, http.client.HTTPException) as error:
             with self._lock:
-                if begin < self.ending:
+                if sent < self.ending:
                     self.failed.append(f"{path}: {error!r}")
                 else:
                     self.turned_away += 1

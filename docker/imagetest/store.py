@@ -1,6 +1,7 @@
 """Images made and kept by buildah."""
 
 import json
+import platform
 import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 BASE = "docker.io/library/debian:bookworm-slim"
+NODE = "docker.io/library/node:22-bookworm-slim"
 _NOT_IN_SLIM = ("man", "locale", "info", "groff", "lintian", "linda")
 
 
@@ -60,6 +62,18 @@ class Store:
         self.buildah("config", "--cmd", "bash", container)
         self.buildah("commit", "--quiet", "--rm", container, BASE)
         shutil.rmtree(root)
+
+    def make_node(self, base: str) -> None:
+        """Make what Node's image holds from a base and npm's registry, under its name."""
+        prefix = self.folder / "node"
+        shutil.rmtree(prefix, ignore_errors=True)
+        processor = {"x86_64": "x64", "aarch64": "arm64"}[platform.machine()]
+        install = ["npm", "install", "--global", "--no-progress", "--loglevel=error", "--prefix", str(prefix)]
+        subprocess.run([*install, f"node-linux-{processor}@22", "npm@10"], check=True, stdout=subprocess.DEVNULL)
+        container = self.buildah("from", "--pull-never", base)
+        self.buildah("add", "--quiet", container, prefix, "/usr/local")
+        self.buildah("commit", "--quiet", "--rm", container, NODE)
+        shutil.rmtree(prefix)
 
     def build(
         self, context: Path, target: str, *, base: str, secrets: Mapping[str, Path], arguments: Mapping[str, str]
