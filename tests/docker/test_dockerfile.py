@@ -11,7 +11,7 @@ import pytest
 from requirements import requirements
 
 ROOT = Path(__file__).resolve().parents[2]
-OFFLINE_ONLY = {"trimesh", "scikit-learn", "embreex", "scipy", "networkx", "joblib", "distributed", "ifcopenshell"}
+OFFLINE_ONLY = {"trimesh", "scikit-learn", "embreex", "scipy", "networkx", "distributed", "ifcopenshell"}
 
 
 @pytest.fixture(scope="module")

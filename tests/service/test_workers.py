@@ -22,8 +22,9 @@ import httpx
 import psutil
 import pytest
 
-from rayfix_service.http.examples import REPORT_EXAMPLES
 from rayfix_service.http.tables import file_state, forget_changed, load_tables
+from tests.support.reports import REPORT
+from tests.support.server_process import start_server
 
 RUN = """\
     import os, sys, time
@@ -50,7 +51,7 @@ SERVE = """\
         verify(table)
 
     Table.verify = told
-    serve(sys.argv[1], port=0, workers=int(sys.argv[2]))
+    serve(sys.argv[1], port=0, workers=2)
     """
 
 
@@ -135,7 +136,7 @@ def test_a_worker_that_cannot_start_ends_the_service():
 
 @pytest.mark.slow
 def test_a_table_is_verified_once_for_all_workers_and_again_when_it_changes(hall_table_copy: Path):
-    with service(SERVE, str(hall_table_copy), "2") as run:
+    with service(SERVE, str(hall_table_copy)) as run:
         port = int(run.read(r"running on http://127\.0\.0\.1:(\d+)"))
         pids = [int(run.read(r"Started server process \[(\d+)\]")) for _ in range(2)]
         while run.said.count("ready with") < 2:
@@ -161,29 +162,27 @@ def test_a_table_is_verified_once_for_all_workers_and_again_when_it_changes(hall
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_what_was_sent_before_the_end_is_answered(hall_table_path: Path, workers: int):
-    body = json.dumps(REPORT_EXAMPLES["angle_and_time"]["value"]).encode()
+    body = json.dumps(REPORT).encode()
     head = f"POST /v1/positions HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
-    with service(SERVE, str(hall_table_path), str(workers)) as run, ExitStack() as stack:
-        port = int(run.read(r"running on http://127\.0\.0\.1:(\d+)")) if workers > 1 else 0
-        while run.said.count("startup complete") < workers or run.said.count("ready with") < workers:
-            run.read("startup complete|ready with")
-        port = port or int(run.read(r"running on http://127\.0\.0\.1:(\d+)"))
-        first = psutil.Process(run.process.pid)
+    with start_server(hall_table_path, workers=workers) as server, ExitStack() as stack:
+        address = ("127.0.0.1", server.port)
+        server.wait_for("startup complete", workers)
+        first = psutil.Process(server.process.pid)
         answering = first.children() if workers > 1 else [first]
         # All is sent and SIGTERM too while nobody can accept a connection, let alone read from it.
         for process in answering:
             process.suspend()
-        connections = [stack.enter_context(socket.create_connection(("127.0.0.1", port), 30)) for _ in range(40)]
+        connections = [stack.enter_context(socket.create_connection(address, 30)) for _ in range(40)]
         for connection in connections:
             connection.sendall(f"{head}\r\n\r\n".encode() + body)
         first.terminate()
-        time.sleep(0.6)  # the first process looks twice a second
+        time.sleep(0.6)  # the first process of several looks twice a second
         for process in answering:
             process.resume()
         assert [connection.recv(12) for connection in connections] == [b"HTTP/1.1 200"] * 40
-        run.process.communicate(timeout=30)
+        server.process.wait(30)
         with pytest.raises(ConnectionRefusedError):
-            socket.create_connection(("127.0.0.1", port))
+            socket.create_connection(address)
 
 
 def test_the_first_process_lets_go_of_a_table_whose_file_has_changed(hall_table_copy: Path):
@@ -207,7 +206,7 @@ def test_the_first_process_lets_go_of_a_table_whose_file_has_changed(hall_table_
 def test_a_damaged_table_is_refused_before_there_are_workers(hall_table_copy: Path):
     with h5py.File(hall_table_copy, "r+") as file:
         file["scene/vertices_m"][0, 0] += 1.0
-    with service(SERVE, str(hall_table_copy), "2") as run:
+    with service(SERVE, str(hall_table_copy)) as run:
         run.read(r"CorruptTableError: .*copy\.h5 is damaged: the checksum of .* restore it from a copy")
         assert run.process.wait(10) != 0
         assert "running on" not in run.said
