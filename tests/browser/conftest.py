@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -76,5 +77,6 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
     for page, url, errors, requests in pages:
         page.close()
         assert errors == []
-        origin = url.split("#")[0].rstrip("/")
+        parts = urlsplit(url)
+        origin = f"{parts.scheme}://{parts.netloc}/" if parts.netloc else url.split("#")[0]
         assert [r for r in requests if not r.startswith((origin, "data:"))] == []

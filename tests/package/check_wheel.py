@@ -50,19 +50,20 @@ from rayfix_service.web.assets import load_assets
 async def main():
     app = create_app(pathlib.Path("demo/hall.h5"))
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test") as client:
-        page = await client.get("/")
-        files = [await client.get(name) for name in load_assets() if name.startswith("assets/")]
-    print(page.status_code, "assets/" in page.text, len(files), all(f.status_code == 200 for f in files))
+        viewer, interface = [await client.get(name) for name in ("/", "/docs")]
+        files = [await client.get(name) for name in load_assets() if "/" in name]
+    whole = "assets/" in viewer.text and "interface/" in interface.text
+    print(whole, len(files), all(answer.status_code == 200 for answer in (viewer, interface, *files)))
 
 asyncio.run(main())
 """
 
 
 def check_viewer(folder: Path, python: Path) -> None:
-    """Ask the installed service for its viewer."""
+    """Ask the installed service for its viewer and the page of its interface."""
     subprocess.run([str(python), "-m", "pip", "install", "--quiet", "httpx"], check=True)
     answer = run(folder, python, "-c", PAGE).strip()
-    if answer == "200 True 2 True":
+    if answer == "True 5 True":
         print("the wheel has the viewer")
     elif not (ROOT / "service" / "rayfix_service" / "web" / "static" / "index.html").is_file():
         print("the wheel has NO viewer, since it could not be built here; 'make viewer' says why")

@@ -95,6 +95,11 @@ def test_the_example_of_a_problem_is_what_comes(hall_app: RunningApp):
 
 
 def test_the_docs_are_there(hall_app: RunningApp):
+    """Also where the page is not built; nothing in it, nor in what it may get, is of another address."""
     response = hall_app.get("/docs")
     assert response.status_code == 200
-    assert "/openapi.json" in response.text
+    assert '"openapi.json"' in response.text
+    assert "//" not in response.text
+    policy = response.headers["content-security-policy"]
+    assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self'")
+    assert "unsafe" not in policy

@@ -251,23 +251,25 @@ def test_the_posterior_of_a_report(web: RunningApp, table: Table):
 # --- files -------------------------------------------------------------------------------------------------
 
 
-def test_the_page_and_its_files_are_strict_and_cached(web: RunningApp):
+@pytest.mark.parametrize(("address", "folder"), [("/", "assets"), ("/docs", "interface")])
+def test_a_page_and_its_files_are_strict_and_cached(web: RunningApp, address: str, folder: str):
     if not assets.load_assets():
         pytest.skip("the viewer is not built; run make viewer")
-    page = web.get("/")
+    page = web.get(address)
     assert page.headers["content-type"].startswith("text/html")
     policy = page.headers["content-security-policy"]
     assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self'")
     assert "unsafe" not in policy
     assert page.headers["cache-control"] == "no-cache"
-    again = web.get("/", headers={"If-None-Match": page.headers["etag"]})
+    again = web.get(address, headers={"If-None-Match": page.headers["etag"]})
     assert again.status_code == 304
     script = next(line.split('"')[-2] for line in page.text.splitlines() if "<script" in line)
+    assert script.startswith(f"./{folder}/")
     response = web.get(script.removeprefix("."))
     assert response.headers["cache-control"] == "public, max-age=31536000, immutable"
     assert response.headers["content-encoding"] == "gzip"
-    assert web.get("/assets/../index.html").status_code == 404
-    assert web.get("/assets/nothing.js").status_code == 404
+    assert web.get(f"/{folder}/../index.html").status_code == 404
+    assert web.get(f"/{folder}/nothing.js").status_code == 404
 
 
 def test_the_built_files_are_below_a_megabyte():

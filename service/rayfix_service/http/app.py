@@ -144,6 +144,7 @@ def create_app(
         description=_DESCRIPTION,
         version="1",
         lifespan=lifespan,
+        docs_url=None,  # FastAPI's own page gets its script from elsewhere; routes_assets has one that does not
         redoc_url=None,
         redirect_slashes=False,  # a redirected POST loses its body in many clients; a 404 is clear
         # The figures are those of /metrics; and to ask at each request whether others are wanted takes long.

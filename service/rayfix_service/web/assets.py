@@ -1,4 +1,4 @@
-"""The viewer's built files, as they go over the wire.
+"""The built files of the viewer and of the page of the HTTP interface, as they go over the wire.
 
 ``make viewer`` builds them into ``static/``; a wheel has them. They are small and few, so they are read once and kept,
 compressed as well.
@@ -14,6 +14,10 @@ STATIC = Path(__file__).with_name("static")
 """Where the built files are."""
 
 INDEX = "index.html"
+"""The viewer's page."""
+
+INTERFACE = "interface.html"
+"""The page that shows the OpenAPI document."""
 
 CONTENT_SECURITY_POLICY = "; ".join(
     [
@@ -27,7 +31,7 @@ CONTENT_SECURITY_POLICY = "; ".join(
         "frame-ancestors 'none'",
     ]
 )
-"""The page runs its own files and talks to its own service, nothing else."""
+"""A page runs its own files and talks to its own service, nothing else."""
 
 SECURITY_HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY,
@@ -50,7 +54,7 @@ class Asset:
         The file, and what gzip makes of it; None where that does not pay.
     media_type : str
     cache_control : str
-        For good where the name has a hash of the content in it.
+        For good where the name has a hash of the content in it, as in all subfolders.
     tag : str
         Entity tag.
     """
@@ -66,10 +70,10 @@ def load_assets(folder: Path = STATIC) -> dict[str, Asset]:
     """Read the built files, by their path below the folder; none where the viewer is not built."""
     if not (folder / INDEX).is_file():
         return {}
-    return {path.relative_to(folder).as_posix(): _load(path) for path in folder.rglob("*") if path.is_file()}
+    return {path.relative_to(folder).as_posix(): _load(path, folder) for path in folder.rglob("*") if path.is_file()}
 
 
-def _load(path: Path) -> Asset:
+def _load(path: Path, folder: Path) -> Asset:
     body = path.read_bytes()
     media_type = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
     if path.suffix == ".js":
@@ -78,6 +82,6 @@ def _load(path: Path) -> Asset:
         body=body,
         compressed=gzip.compress(body, 9, mtime=0) if path.suffix in _COMPRESSIBLE else None,
         media_type=media_type,
-        cache_control=_FOREVER if path.parent.name == "assets" else "no-cache",
+        cache_control="no-cache" if path.parent == folder else _FOREVER,
         tag=f'"{hashlib.sha256(body).hexdigest()[:32]}"',
     )

@@ -1,11 +1,11 @@
-"""The viewer's page and its files."""
+"""The viewer's page, the page of the HTTP interface, and their files."""
 
 from functools import cache
 
 from fastapi import APIRouter, Request, Response
 from starlette.exceptions import HTTPException
 
-from rayfix_service.web.assets import INDEX, SECURITY_HEADERS, Asset, load_assets
+from rayfix_service.web.assets import INDEX, INTERFACE, SECURITY_HEADERS, Asset, load_assets
 
 router = APIRouter(include_in_schema=False)
 
@@ -15,9 +15,9 @@ _NOT_BUILT = """\
 <meta charset="utf-8">
 <title>rayfix</title>
 <h1>rayfix</h1>
-<p>The service runs, but its viewer is not built. With Node.js 20.19 or later, run <code>make viewer</code> in the
-checkout and start the service again. Installed packages have the viewer.
-<p><a href="/docs">The HTTP interface</a>
+<p>The service runs, but its pages are not built. With Node.js 20.19 or later, run <code>make viewer</code> in the
+checkout and start the service again. Installed packages have them.
+<p><a href="openapi.json">The OpenAPI document of the HTTP interface</a>
 </html>
 """
 
@@ -30,16 +30,36 @@ def _assets() -> dict[str, Asset]:
 @router.api_route("/", methods=["GET", "HEAD"])
 async def get_viewer(request: Request) -> Response:
     """Give the viewer's page."""
-    asset = _assets().get(INDEX)
+    return _page(request, INDEX)
+
+
+@router.api_route("/docs", methods=["GET", "HEAD"])
+async def get_interface(request: Request) -> Response:
+    """Give the page that shows the OpenAPI document."""
+    return _page(request, INTERFACE)
+
+
+@router.api_route("/assets/{name:path}", methods=["GET", "HEAD"])
+async def get_viewer_file(request: Request, name: str) -> Response:
+    """Give one of the viewer's files; their names change with their content."""
+    return _file(request, f"assets/{name}")
+
+
+@router.api_route("/interface/{name:path}", methods=["GET", "HEAD"])
+async def get_interface_file(request: Request, name: str) -> Response:
+    """Give one of the files of the page of the interface, likewise."""
+    return _file(request, f"interface/{name}")
+
+
+def _page(request: Request, name: str) -> Response:
+    asset = _assets().get(name)
     if asset is None:
         return Response(_NOT_BUILT, media_type="text/html", headers={**SECURITY_HEADERS, "Cache-Control": "no-cache"})
     return _answer(request, asset)
 
 
-@router.api_route("/assets/{name:path}", methods=["GET", "HEAD"])
-async def get_asset(request: Request, name: str) -> Response:
-    """Give one of its files; their names change with their content."""
-    asset = _assets().get(f"assets/{name}")
+def _file(request: Request, name: str) -> Response:
+    asset = _assets().get(name)
     if asset is None:
         raise HTTPException(404)
     return _answer(request, asset)
