@@ -2,6 +2,9 @@
 
 import asyncio
 import math
+import subprocess
+import sys
+import textwrap
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -170,6 +173,51 @@ def test_a_bucket_empties_and_fills():
     for client in ("a", "b"):
         limit.charge(client, 4)
         assert limit.seconds_to_wait(client) == 0.5
+
+
+def test_each_client_has_an_account_of_its_own():
+    """As long as there is room; with many more clients than places, some share, and all are still limited."""
+    limit = RateLimit(2.0, 4.0, clock=lambda: 100.0)
+    for count, some_share in ((200, False), (20_000, True)):
+        names = [f"{count} {n}" for n in range(count)]
+        for n, name in enumerate(names):
+            limit.charge(name, 3 + n % 5)
+        waits = [limit.seconds_to_wait(name) for name in names]
+        expected = [0.5 * (n % 5) for n in range(count)]
+        assert (waits != expected) == some_share
+        if not some_share:
+            assert sorted(set(waits)) == [0.0, 0.5, 1.0, 1.5, 2.0]
+
+
+def test_a_full_bucket_leaves_its_place():
+    """What all places knew of is forgotten once it no longer counts."""
+    now = 100.0
+    limit = RateLimit(2.0, 4.0, clock=lambda: now)
+    for n in range(20_000):
+        limit.charge(f"old {n}", 4)
+    now += 20_000.0
+    for n in range(200):
+        limit.charge(f"new {n}", 4)
+    assert {limit.seconds_to_wait(f"new {n}") for n in range(200)} == {0.5}
+    assert {limit.seconds_to_wait(f"old {n}") for n in range(200)} == {0.0}
+
+
+def test_forked_processes_share_accounts():
+    script = """
+        import os
+        from rayfix_service.http.rates import RateLimit
+        limit = RateLimit(2.0, 4.0, clock=lambda: 100.0)
+        limit.charge("a", 3)
+        for _ in range(3):
+            if not os.fork():
+                limit.charge("a", 2)
+                limit.charge("b")
+                os._exit(0)
+            os.wait()
+        print(limit.seconds_to_wait("a"), limit.seconds_to_wait("b"), limit.seconds_to_wait("c"))
+        """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["3.0", "0.0", "0.0"]
 
 
 def test_each_key_has_its_rate(hall_table_path: Path, tmp_path: Path):

@@ -24,7 +24,7 @@ from rayfix_service.http.keys import ApiKeys
 from rayfix_service.http.locating import Answerer
 from rayfix_service.http.metrics import Metrics, forget_dead_workers
 from rayfix_service.http.problems import Problem, install_problems
-from rayfix_service.http.rates import RateLimit
+from rayfix_service.http.rates import Accounts, RateLimit
 from rayfix_service.http.request_context import HEADER, RequestContext
 from rayfix_service.http.routes_stream import FixEventDocument
 from rayfix_service.http.settings import ServiceSettings
@@ -78,6 +78,7 @@ def create_app(
     settings: ServiceSettings | None = None,
     *,
     at_hand: dict[str, ServedTable] | None = None,
+    accounts: Accounts | None = None,
 ) -> FastAPI:
     """Make the web application that answers from one table or several.
 
@@ -91,6 +92,8 @@ def create_app(
     settings : ServiceSettings, optional
     at_hand : dict of str to ServedTable, optional
         Tables that are verified already, by name; they answer at once. The application takes them out.
+    accounts : Accounts, optional
+        Of the clients' rates, which several processes may share.
 
     Raises
     ------
@@ -156,7 +159,7 @@ def create_app(
     app.state.feed = FixFeed()
     app.state.relay = None
     keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
-    app.state.rate_limit = limit = _rate_limit(settings)
+    app.state.rate_limit = limit = _rate_limit(settings, accounts)
     app.add_middleware(ShortWay, path="/v1/positions", answer=routes_positions.answer_position)  # inside all others
     app.add_middleware(Access, keys=keys, limit=limit)
     if settings.cors_origins:
@@ -181,9 +184,9 @@ def create_app(
     return app
 
 
-def _rate_limit(settings: ServiceSettings) -> RateLimit | None:
+def _rate_limit(settings: ServiceSettings, accounts: Accounts | None) -> RateLimit | None:
     rate = settings.reports_per_second
-    return None if rate is None else RateLimit(rate, max(1.0, rate * settings.burst_seconds))
+    return None if rate is None else RateLimit(rate, max(1.0, rate * settings.burst_seconds), accounts=accounts)
 
 
 async def _keep_keys(keys: ApiKeys, seconds: float) -> None:

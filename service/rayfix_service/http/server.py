@@ -21,6 +21,7 @@ from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.keys import read_key_file
 from rayfix_service.http.logs import LogFormat, log_config
 from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE, share_figures
+from rayfix_service.http.rates import Accounts
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.tables import forget_changed, load_tables
 from rayfix_service.http.workers import COULD_NOT_START, run_workers
@@ -30,6 +31,11 @@ _MAX_MESSAGE = 16 << 20  # bytes; up to here a message that is too long is answe
 _FIGURES_BYTES = 8 << 20  # of some workers
 _SHUTDOWN_SECONDS = 10  # for requests under way; a full batch takes about one
 _ARRIVING_SECONDS = 0.2  # for requests that are on the way to this process when it is told to end
+
+_TRACKS = (
+    "each of the %d workers follows targets by itself, and the system chooses who answers a connection: a target's "
+    "reports belong on one connection; else serve with one worker on each of several ports, balanced by target_id"
+)
 
 _log = logging.getLogger(__name__)
 
@@ -89,7 +95,7 @@ def serve(
             _check_room(Path(os.environ[MULTIPROCESS_VARIABLE]))
         at_hand = load_tables(path)
         config = uvicorn.Config(
-            partial(create_app, path, settings, at_hand=at_hand),
+            partial(create_app, path, settings, at_hand=at_hand, accounts=Accounts()),
             factory=True,
             host=host,
             port=port,
@@ -104,6 +110,8 @@ def serve(
             with suppress(KeyboardInterrupt):
                 _run(config)
             return
+        if settings.track:
+            _log.warning(_TRACKS, workers)
         gc.collect()
         gc.freeze()  # a collection would write to what the workers share, and so copy it
         with config.bind_socket() as bound:

@@ -24,7 +24,7 @@ class ServiceSettings:
     api_keys : pathlib.Path, optional
         File of the API keys; without it, none is asked for.
     reports_per_second : float, optional
-        Reports that each key may send a second, on average over ``burst_seconds``, to each worker process.
+        Reports that each key may send a second, on average over ``burst_seconds``.
     burst_seconds : float
     cors_origins : tuple of str
         Origins such as ``https://maps.example.com`` whose pages may call the service from a browser.
