@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.axes import semi_axes
 from rayfix_service.fusion.kernels import cholesky
+from rayfix_service.fusion.selection import nth_smallest
 from rayfix_service.fusion.voxels import is_free
 from rayfix_tables.freespace import FreeSpace
 
@@ -180,8 +181,8 @@ def _accuracies(points: Any, position: Any, covariance: Any, place: Any) -> Any:
         x, y = points[n, 0] - position[0], points[n, 1] - position[1]
         horizontal[n] = x * x + y * y
         vertical[n] = abs(points[n, 2] - position[2])
-    radius = math.sqrt(np.partition(horizontal, place)[place])
-    half_height = np.partition(vertical, place)[place]
+    radius = math.sqrt(nth_smallest(horizontal, place))
+    half_height = nth_smallest(vertical, place)
     best = _scale(_squared_distances(points, position, covariance), place) * covariance
     whole = _second_moment(points, position) + 1e-9 * covariance
     other = _scale(_squared_distances(points, position, whole), place) * whole
@@ -191,7 +192,7 @@ def _accuracies(points: Any, position: Any, covariance: Any, place: Any) -> Any:
 @numba.njit(cache=True, nogil=True)
 def _scale(squared_distances: Any, place: Any) -> Any:
     """Factor that makes an ellipsoid reach to the point at a place."""
-    return max(np.partition(squared_distances, place)[place], 1e-12)
+    return max(nth_smallest(squared_distances, place), 1e-12)
 
 
 @numba.njit(cache=True, nogil=True)

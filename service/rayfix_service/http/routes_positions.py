@@ -81,7 +81,7 @@ async def post_batch(
         limit.charge(client_of(request), len(documents) - 1)  # one was charged for the request
     results: list[dict[str, Any]] = []
     patience = Patience(request)
-    for document in documents:
+    for document in documents:  # not by locate_batch: other batches keep the other workers, one for each core, as busy
         await patience.take_a_breath()
         results.append(await answerer.answer_or_problem(table, partial(native, document), wanted))
     return JsonAnswer({"results": results})

@@ -1,0 +1,54 @@
+"""The n-th smallest of some values, compiled."""
+
+from typing import Any
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True, nogil=True)
+def nth_smallest(values: Any, place: Any) -> Any:
+    """Value that stands at a place, counted from 0, once values are in their order.
+
+    An interval around it is halved until it holds no other value. To count what is below its middle takes no branches
+    and one instruction for several values; partitioning, whose comparisons no processor foresees, takes eight times as
+    long for a thousand values.
+
+    Parameters
+    ----------
+    values : ndarray of shape (n,)
+        Finite.
+    place : int
+        From 0 to n - 1.
+    """
+    low, high = values.min(), values.max()
+    if _count_up_to(values, low) > place:
+        return low
+    # No more than `place` values are up to low, more than that up to high.
+    while True:
+        middle = 0.5 * low + 0.5 * high
+        if not low < middle < high:
+            return high
+        count = _count_up_to(values, middle)
+        if count == place + 1:
+            return _largest_up_to(values, middle)
+        if count > place:
+            high = middle
+        else:
+            low = middle
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_up_to(values: Any, limit: Any) -> Any:
+    count = 0
+    for n in range(len(values)):
+        count += values[n] <= limit
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _largest_up_to(values: Any, limit: Any) -> Any:
+    largest = -np.inf
+    for n in range(len(values)):
+        largest = max(largest, values[n] if values[n] <= limit else -np.inf)
+    return largest
