@@ -8,12 +8,14 @@ import resource
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from joblib import Parallel, delayed
 
+from rayfix_offline.balance import balanced
 from rayfix_offline.former import read_former
 from rayfix_offline.holes import LOST_RAYS_WARNING
 from rayfix_offline.plan import StationPlan, plan_build
@@ -151,6 +153,8 @@ def build_table(
                 station = build_station(plan, job, remote, _after(done, total, report))
             built.append(station)
             done += plan.num_cells
+    report("balancing", done, total)
+    built = _balanced(built, site, twin, jobs)
     contents = [station.content for station in built]
     if not any(len(level.mixture) for content in contents for level in content.levels):
         raise BuildError("no ray of any station finds free space; check the stations' positions and fields of view")
@@ -172,6 +176,18 @@ def build_table(
         stations=tuple(_summary(plan.station.id, station) for plan, station in zip(plans, built, strict=True)),
         warnings=(*(finding.message for finding in twin.findings), *_lost_ray_warnings(plans, contents, twin)),
     )
+
+
+def _balanced(stations: list[BuiltStation], site: SiteFile, twin: Twin, jobs: int) -> list[BuiltStation]:
+    """Balance all levels, if their prior makes the probabilities of the paths to a place add up to 1."""
+    if site.propagation.path_prior != "power":
+        return stations
+    levels = [level for station in stations for level in station.content.levels]
+    done = iter(Parallel(n_jobs=jobs, prefer="threads")(delayed(balanced)(level, twin.free_space) for level in levels))
+    return [
+        replace(station, content=replace(station.content, levels=tuple(next(done) for _ in station.content.levels)))
+        for station in stations
+    ]
 
 
 def _connect(address: str, site: SiteFile, twin: Twin) -> "Cluster":

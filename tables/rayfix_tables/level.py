@@ -1,6 +1,7 @@
 """A level: all cells of one station at one window."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,9 @@ class Level:
         Natural logarithm of the integral of the cell's measure; -inf for a cell without components.
     mixture : TubeMixture
         Components of all cells.
+    log_balance : ndarray of shape (n_components,) or (0,)
+        Added to the components' ``log_weight`` where places are compared: at each place, the probabilities of its paths
+        then add up to 1, as far as Gaussians can. Without entries where the level is not balanced.
     """
 
     window: float
@@ -33,6 +37,7 @@ class Level:
     cell_offsets: NDArray[np.int64]
     cell_log_mass: NDArray[np.float64]
     mixture: TubeMixture
+    log_balance: NDArray[Any] = field(default_factory=lambda: np.zeros(0, np.float32))
 
     @property
     def num_cells(self) -> int:
@@ -51,5 +56,6 @@ class Level:
     @property
     def num_bytes(self) -> int:
         """Size of the level's arrays in the file."""
-        arrays = [getattr(self.mixture, name) for name in FIELD_SHAPES]
-        return sum(a.nbytes for a in (self.grid.ring_cells, self.cell_offsets, self.cell_log_mass, *arrays))
+        arrays = [self.grid.ring_cells, self.cell_offsets, self.cell_log_mass, self.log_balance]
+        arrays += [getattr(self.mixture, name) for name in FIELD_SHAPES]
+        return sum(array.nbytes for array in arrays)

@@ -31,6 +31,9 @@ LEVEL_DATASETS: dict[str, tuple[type[np.generic], int]] = {
 }
 """Type and number of axes of a level's datasets."""
 
+LOG_BALANCE: tuple[type[np.generic], int] = (np.float32, 1)
+"""Type and number of axes of a level's ``log_balance``, which only balanced levels have."""
+
 CELL_CHANGE: tuple[type[np.generic], int] = (np.float32, 1)
 """Type and number of axes of a level's ``cell_change``, which only updated parts have."""
 

@@ -22,6 +22,7 @@ from rayfix_tables.schema import (
     FORMAT,
     FORMAT_VERSION,
     LEVEL_DATASETS,
+    LOG_BALANCE,
     SCENE_DATASETS,
     array_digest,
     content_attributes,
@@ -227,6 +228,9 @@ def _read_level(group: h5py.Group, mapped: NDArray[np.uint8]) -> Level:
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{group.name}/{name} has the shape {arrays[name].shape}, not {shape}")
+    log_balance = _map(group["log_balance"], LOG_BALANCE, mapped) if "log_balance" in group else np.zeros(0, np.float32)
+    if len(log_balance) not in (0, len(mixture)):
+        raise ValueError(f"{group.name}/log_balance has {len(log_balance)} entries, not {len(mixture)}")
     steps = np.diff(arrays["cell_offsets"], prepend=0, append=len(mixture))
     if steps[0] != 0 or steps[-1] != 0 or np.any(steps < 0):
         raise ValueError(f"{group.name}/cell_offsets do not run from 0 to {len(mixture)}")
@@ -236,6 +240,7 @@ def _read_level(group: h5py.Group, mapped: NDArray[np.uint8]) -> Level:
         cell_offsets=arrays["cell_offsets"],
         cell_log_mass=arrays["cell_log_mass"],
         mixture=mixture,
+        log_balance=log_balance,
     )
 
 

@@ -237,6 +237,8 @@ def _write_level(group: h5py.Group, level: Level) -> None:
     stored = level.mixture.as_stored()
     for name in FIELD_SHAPES:
         _write(group, name, getattr(stored, name))
+    if len(level.log_balance):
+        _write(group, "log_balance", level.log_balance.astype(np.float32))
 
 
 def _write_update(group: h5py.Group, update: Update) -> None:

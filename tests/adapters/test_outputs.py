@@ -17,7 +17,6 @@ from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.omlox import fix_to_omlox
 from rayfix_service.adapters.threegpp import fix_to_3gpp
 from rayfix_service.fusion.credible import CredibleRegions
-from rayfix_service.fusion.normal import normal_points
 from rayfix_service.fusion.report import Candidate, Fix, Outcome
 from rayfix_service.http.examples import LOCAL_3D_EXAMPLE, OMLOX_EXAMPLE
 from rayfix_service.http.outputs import Local3dPointUncertaintyEllipsoid, OmloxLocation
@@ -25,6 +24,7 @@ from rayfix_service.moments import utc_milliseconds
 from rayfix_service.tracking.estimate import Estimate
 from rayfix_service.tracking.tracker import TrackedPosition
 from rayfix_tables.errors import ReportError
+from rayfix_tables.normal import normal_points
 from rayfix_tables.site import SiteInfo
 
 SITE = SiteInfo(name="hall", north=math.radians(90), max_path_length=60.0, stations=())

@@ -66,6 +66,18 @@ def test_the_table_is_whole(table_path: Path, site_path: Path) -> None:
             assert np.all((points > -0.05) & (points < np.array([4.05, 5.05, 3.05])))
 
 
+@pytest.mark.parametrize(("path_prior", "balances"), [("power", True), ("uniform", False), ("paper", False)])
+def test_levels_are_balanced_where_the_paths_to_a_place_have_probabilities(
+    tmp_path: Path, write_site: WriteSite, path_prior: str, balances: bool
+) -> None:
+    site_path = write_site(tmp_path, propagation={"path_prior": path_prior}, table={"windows_deg": [20.0]})
+    build_table(site_path, tmp_path / "t.h5", jobs=1)
+    (part,) = Table.open(tmp_path / "t.h5").parts.values()
+    for level in part.levels:
+        assert len(level.log_balance) == (level.num_components if balances else 0)
+        assert not balances or 0.01 < np.abs(level.log_balance).max() < 2.1
+
+
 def test_the_summary_says_what_is_in_the_table(site_path: Path, tmp_path: Path) -> None:
     summary = build_table(str(site_path), str(tmp_path / "t.h5"), jobs=1)
     table = Table.open(tmp_path / "t.h5")

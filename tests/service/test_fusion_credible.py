@@ -14,10 +14,10 @@ from rayfix_service.fusion import reference
 from rayfix_service.fusion.axes import semi_axes
 from rayfix_service.fusion.beam import Hypotheses
 from rayfix_service.fusion.credible import CredibleRegions, Ellipsoid, posterior_points
-from rayfix_service.fusion.normal import normal_points
 from rayfix_service.fusion.posterior import make_posterior
 from rayfix_service.fusion.prior import even_prior
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.normal import normal_points
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,7 @@
 """The fusion's compiled kernels against their NumPy twins, and the closed forms against sampling."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,21 +11,22 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from rayfix_service.fusion import beam_kernels, factor_kernels, kernels, mode_kernels, natural, reference
+from rayfix_service.fusion import beam_kernels, factor_kernels, mode_kernels, natural, reference
 from rayfix_service.fusion.factor_kernels import ALL_GOOD
 from rayfix_service.fusion.factors import make_factor
 from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.likelihood import Term, gaussian_terms, log_normal_terms, spreads
 from rayfix_service.fusion.lookup import Direction
-from rayfix_service.fusion.normal import unit_points
 from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.report import GAUSSIAN, ErrorModel
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_tables.conditioning import condition_on_angle
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture, pack, unpack
+from rayfix_tables.normal import unit_points
 from rayfix_tables.site import Station
 from rayfix_tables.table import StationPart
 
@@ -101,7 +103,7 @@ def test_condition_on_angle_equals_the_joint_gaussian(dtype: type[np.floating[An
     # Three cells that are not neighbours; the second is empty.
     begins, ends = np.array([5, 3, 0]), np.array([10, 3, 3])
     log_evidence, mean, cov = np.empty(8), np.empty((8, 4)), np.empty((8, 4, 4))
-    kernels.condition_on_angle(*stored.values(), begins, ends, rest_mean, rest_cov, log_factor, log_evidence, mean, cov)
+    condition_on_angle(*stored.values(), begins, ends, rest_mean, rest_cov, log_factor, log_evidence, mean, cov)
     for cell, out in ((0, slice(0, 5)), (2, slice(5, 8))):
         expected = reference.condition_on_angle(
             mixture[begins[cell] : ends[cell]], rest_mean[cell], rest_cov[cell], log_factor[cell]
@@ -307,6 +309,20 @@ def one_cell_station(mixture: TubeMixture, log_mass: float, cell: int, window: f
     level = Level(window=window, grid=grid, cell_offsets=offsets, cell_log_mass=masses, mixture=mixture)
     station = Station(id="a", position=(0.0, 0.0, 0.0))
     return StationPart(station=station, levels=(level,), lost_ray_share=0.0, coverage=(1.0,))
+
+
+def test_a_balance_is_added_to_its_own_components() -> None:
+    rng = np.random.default_rng(8)
+    part = one_cell_station(random_mixture(rng, 4).as_stored(), 0.5, 12, 0.1)
+    (level,) = part.levels
+    balance = rng.normal(size=4).astype(np.float32)
+    raised = replace(part, levels=(replace(level, log_balance=balance),))
+    azimuth, zenith = level.grid.centres[12]
+    measured = Direction(azimuth=float(azimuth), zenith=float(zenith), cov=0.05**2 * np.eye(2))
+    before, after = HeardStation(part).towards(measured), HeardStation(raised).towards(measured)
+    np.testing.assert_allclose(after.log_evidence - before.log_evidence, balance, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(after.mean, before.mean)
+    np.testing.assert_array_equal(after.cov, before.cov)
 
 
 BIAS_STDEV = 0.3  # m

@@ -7,8 +7,8 @@ from scipy.stats import norm
 
 from rayfix_service.fusion import mode_kernels, reference
 from rayfix_service.fusion.modes import cut_to_free_space, find_modes
-from rayfix_service.fusion.normal import unit_points
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.normal import unit_points
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from rayfix_service.fusion.credible import CredibleRegions
-from rayfix_service.fusion.normal import normal_points
 from rayfix_service.fusion.report import (
     Angle,
     Candidate,
@@ -28,6 +27,7 @@ from rayfix_service.fusion.report import (
 )
 from rayfix_service.http.examples import FIX_EXAMPLE, REPORT_EXAMPLES
 from rayfix_service.wire import FixDocument, fix_to_document, parse_report, report_to_document
+from rayfix_tables.normal import normal_points
 
 # --- fixes ------------------------------------------------------------------------------------------------
 

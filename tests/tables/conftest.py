@@ -70,6 +70,7 @@ def random_content(
                     cell_offsets=np.concatenate([[0], np.cumsum(counts)]),
                     cell_log_mass=np.where(counts > 0, rng.normal(size=len(counts)), -np.inf),
                     mixture=random_mixture(rng, int(counts.sum())),
+                    log_balance=rng.normal(size=int(counts.sum()) * (not levels)).astype(np.float32),  # the first only
                 )
             )
         contents.append(

@@ -125,7 +125,18 @@ def test_a_missing_group(small_table_path: Path, group: str) -> None:
     refused(small_table_path, CorruptTableError, REBUILD)
 
 
-@pytest.mark.parametrize("name", [n for n in DATASETS if n != "scene/free_space"])
+BALANCE = "stations/bs1/levels/0/log_balance"
+
+
+def test_a_missing_balance_is_found_by_its_checksum(small_table_path: Path) -> None:
+    """Without one, a level is as tables before it had it; this table is not that."""
+    with h5py.File(small_table_path, "r+") as file:
+        del file[BALANCE]
+    assert len(Table.open(small_table_path).parts["bs1"].levels[0].log_balance) == 0
+    refused(small_table_path, CorruptTableError, "the table_id does not match", read=verified)
+
+
+@pytest.mark.parametrize("name", [BALANCE, *(n for n in DATASETS if n != "scene/free_space")])
 def test_a_dataset_of_another_length(small_table_path: Path, name: str) -> None:
     """Of another length than the rest, or of another type: an answer from it would be nonsense."""
     with h5py.File(small_table_path, "r+") as file:

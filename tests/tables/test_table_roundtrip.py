@@ -52,6 +52,7 @@ def assert_same_table(table: Table, content: Any) -> None:
             assert_same_bits(level.grid.ring_cells, expected.grid.ring_cells)
             assert_same_bits(level.cell_offsets, expected.cell_offsets)
             assert_same_bits(level.cell_log_mass, expected.cell_log_mass)
+            assert_same_bits(level.log_balance, expected.log_balance)
             for name in FIELD_SHAPES:
                 assert_same_bits(getattr(level.mixture, name), getattr(expected.mixture, name))
     scene = content.scene
@@ -241,6 +242,8 @@ def variations(content: Any) -> dict[str, Any]:
         "ring_cells": with_level(grid=AngularGrid(ring_cells=level.grid.ring_cells[::-1] + np.arange(20)[-1])),
         "cell_offsets": with_level(cell_offsets=nudged(level.cell_offsets)),
         "cell_log_mass": with_level(cell_log_mass=level.cell_log_mass + 1e-12),
+        "log_balance": with_level(log_balance=nudged(level.log_balance)),
+        "no balance": with_level(log_balance=level.log_balance[:0]),
         "vertices": with_scene(vertices=nudged(scene.vertices)),
         "faces": with_scene(faces=nudged(scene.faces)),
         "face_materials": with_scene(face_materials=nudged(scene.face_materials)),
@@ -262,7 +265,7 @@ def test_the_id_changes_with_every_part_of_the_content(make_content: Callable[..
     for name, varied in variations(content).items():
         ids[name] = varied.write(tmp_path / "t.h5")
     assert len(set(ids.values())) == len(ids)
-    assert len(ids) == 25 + len(FIELD_SHAPES)
+    assert len(ids) == 27 + len(FIELD_SHAPES)
 
 
 def with_update(content: Any, seed: int = 0) -> Any:

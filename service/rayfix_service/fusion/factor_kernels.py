@@ -5,9 +5,9 @@ from typing import Any
 import numba
 import numpy as np
 
-from rayfix_service.fusion.kernels import LOG_2PI
 from rayfix_service.fusion.merging import NO_NOISE, merge_gaussians
 from rayfix_service.fusion.natural import integrate_last, invert_all, triangle
+from rayfix_tables.conditioning import LOG_2PI
 
 ALL_GOOD, TIME_OUTLIER, ALL_OUTLIER = 0, 1, 2
 """What an alternative takes for an outlier: nothing, the observation's times, or all of it."""

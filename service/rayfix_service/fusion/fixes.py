@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from rayfix_service.fusion.beam import Hypotheses
 from rayfix_service.fusion.credible import CredibleRegions, posterior_points
 from rayfix_service.fusion.modes import cut_to_free_space, find_modes
-from rayfix_service.fusion.normal import normal_points, unit_points
 from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.outliers import outlier_probabilities
 from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.report import Candidate, Fix, Outcome, Report, Status
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_tables.normal import normal_points, unit_points
 from rayfix_tables.table import Table
 
 _LEAST_CANDIDATE = 1e-3

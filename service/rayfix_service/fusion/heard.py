@@ -9,10 +9,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.kernels import condition_on_angle
 from rayfix_service.fusion.lookup import NO_DIRECTION, Direction, Lookup, look_up
 from rayfix_service.fusion.merging import merge_gaussians
 from rayfix_service.fusion.sight import Sight, is_direct
+from rayfix_tables.conditioning import condition_on_angle
 from rayfix_tables.table import StationPart
 
 _RANGE_STDEV = 0.1
@@ -104,6 +104,7 @@ def _condition(lookup: Lookup) -> Heard:
             mixture.x_mean,
             mixture.jacobian,
             mixture.x_cov,
+            level.log_balance,
             level.cell_offsets,
             level.cell_log_mass,
             lookup.cells,
@@ -122,6 +123,7 @@ def _condition_cells(
     x_mean: Any,
     jacobian: Any,
     x_cov: Any,
+    log_balance: Any,
     cell_offsets: Any,
     cell_log_mass: Any,
     cells: Any,
@@ -154,4 +156,10 @@ def _condition_cells(
         mean,
         cov,
     )
+    if len(log_balance):
+        place = 0
+        for n in range(count):
+            for k in range(begins[n], ends[n]):
+                log_evidence[place] += log_balance[k]
+                place += 1
     return log_evidence, mean, cov

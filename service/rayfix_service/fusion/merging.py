@@ -10,8 +10,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from rayfix_service.fusion.kernels import LOG_2PI
 from rayfix_service.fusion.natural import dimension_of, invert_all, triangle
+from rayfix_tables.conditioning import LOG_2PI
 from rayfix_tables.halving import halve_and_merge
 
 _ONES = (1.0, 1.0, 1.0, 1.0)

@@ -54,7 +54,7 @@ def cut_to_free_space(
     Parameters
     ----------
     points : ndarray of shape (n, 3)
-        From :func:`rayfix_service.fusion.normal.unit_points`.
+        From :func:`rayfix_tables.normal.unit_points`.
     """
     mean, cov, share = mean.copy(), cov.copy(), np.empty(len(mean))
     cut_gaussians(mean, cov, points, free_space.origin, free_space.voxel_size, free_space.free, share)

@@ -19,7 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.kernels import LOG_2PI
+from rayfix_tables.conditioning import LOG_2PI
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rayfix_service.fusion.beam import Hypotheses
-from rayfix_service.fusion.normal import normal_points
 from rayfix_service.fusion.prior import Prior
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.normal import normal_points
 
 _NUM_POINTS = 4096
 """Points that stand for a Gaussian: a share is then known to half a per cent or better, and the sum of many to less."""

@@ -1,0 +1,105 @@
+"""Components of cells, conditioned on a measured angle; the compiled kernel of fusion and balance."""
+
+from typing import Any
+
+import numba
+import numpy as np
+
+LOG_2PI = 1.8378770664093453
+
+
+@numba.njit(cache=True, nogil=True)
+def condition_on_angle(
+    log_weight: Any,
+    u_mean: Any,
+    u_cov: Any,
+    x_mean: Any,
+    jacobian: Any,
+    x_cov: Any,
+    begins: Any,
+    ends: Any,
+    rest_mean: Any,
+    rest_cov: Any,
+    log_factor: Any,
+    out_log: Any,
+    out_mean: Any,
+    out_cov: Any,
+) -> None:
+    """Condition the components of cells on the rest of the measured angle.
+
+    Parameters
+    ----------
+    log_weight, u_mean, u_cov, x_mean, jacobian, x_cov : ndarray
+        Fields of a :class:`~rayfix_tables.mixture.TubeMixture`.
+    begins, ends : ndarray of int64, shape (n,)
+        Components of cell ``c`` are those from ``begins[c]`` to ``ends[c]``.
+    rest_mean : ndarray of shape (n, 2), rad
+    rest_cov : ndarray of shape (n, 3), rad2
+        Packed: horizontal variance, covariance, vertical variance.
+    log_factor : ndarray of shape (n,)
+        Added to the logarithms of all weights of a cell.
+    out_log : ndarray of shape (k,)
+        Log evidence of each component, cell after cell.
+    out_mean : ndarray of shape (k, 4), m
+        Mean of (x, path length).
+    out_cov : ndarray of shape (k, 4, 4), m2
+    """
+    u = np.empty(3)
+    cov = np.empty((3, 3))
+    cross = np.empty((3, 3))
+    slope = np.empty((3, 3))
+    place = 0
+    for c in range(len(begins)):
+        for k in range(begins[c], ends[c]):
+            p00, p01, p02 = np.float64(u_cov[k, 0]), np.float64(u_cov[k, 1]), np.float64(u_cov[k, 2])
+            p11, p12, p22 = np.float64(u_cov[k, 3]), np.float64(u_cov[k, 4]), np.float64(u_cov[k, 5])
+            s11, s12, s22 = p11 + rest_cov[c, 0], p12 + rest_cov[c, 1], p22 + rest_cov[c, 2]
+            det = s11 * s22 - s12 * s12
+            i11, i12, i22 = s22 / det, -s12 / det, s11 / det
+            r1 = rest_mean[c, 0] - u_mean[k, 1]
+            r2 = rest_mean[c, 1] - u_mean[k, 2]
+            g1 = i11 * r1 + i12 * r2
+            g2 = i12 * r1 + i22 * r2
+            out_log[place] = log_factor[c] + log_weight[k] - 0.5 * (r1 * g1 + r2 * g2 + np.log(det)) - LOG_2PI
+            column1 = (p01, p11, p12)
+            column2 = (p02, p12, p22)
+            prior = ((p00, p01, p02), (p01, p11, p12), (p02, p12, p22))
+            for i in range(3):
+                u[i] = column1[i] * g1 + column2[i] * g2
+                k1 = column1[i] * i11 + column2[i] * i12
+                k2 = column1[i] * i12 + column2[i] * i22
+                for j in range(3):
+                    cov[i, j] = prior[i][j] - k1 * column1[j] - k2 * column2[j]
+            # The tube widens: around the new mean it points elsewhere, and its slopes are those of another length.
+            length = np.float64(u_mean[k, 0])
+            stretch = 1.0 + u[0] / length
+            for i in range(3):
+                moved = np.float64(x_mean[k, i])
+                along = np.float64(jacobian[k, i, 0])
+                for a in range(1, 3):
+                    widening = jacobian[k, i, a] / length
+                    moved += jacobian[k, i, a] * u[a] + widening * (u[0] * u[a] + cov[0, a] - prior[0][a])
+                    along += widening * u[a]
+                    slope[i, a] = jacobian[k, i, a] * stretch
+                slope[i, 0] = along
+                out_mean[place, i] = moved + jacobian[k, i, 0] * u[0]
+                for j in range(3):
+                    cross[i, j] = along * cov[0, j] + slope[i, 1] * cov[1, j] + slope[i, 2] * cov[2, j]
+            out_mean[place, 3] = u_mean[k, 0] + u[0]
+            packed = 0
+            for i in range(3):
+                for j in range(i, 3):
+                    total = np.float64(x_cov[k, packed])
+                    packed += 1
+                    for m in range(3):
+                        total += cross[i, m] * slope[j, m]
+                    for a in range(1, 3):
+                        for b in range(1, 3):
+                            products = cov[0, 0] * cov[a, b] + cov[0, a] * cov[0, b]
+                            total += products * jacobian[k, i, a] * jacobian[k, j, b] / (length * length)
+                    out_cov[place, i, j] = total
+                    out_cov[place, j, i] = total
+                out_cov[place, i, 3] = cross[i, 0]
+                out_cov[place, 3, i] = cross[i, 0]
+            out_cov[place, 3, 3] = cov[0, 0]
+            place += 1
