@@ -177,7 +177,7 @@ def test_the_beam_finds_what_the_exhaustive_product_finds(hall: Hall, timing: Ti
         width = math.sqrt(share @ (np.trace(cov, axis1=1, axis2=2) + ((mean - whole_mean) ** 2).sum(axis=1)))  # m
         evidence_errors.append(abs(math.log(kept.sum())))
         shifts.append(np.linalg.norm(kept @ beam.mean / kept.sum() - whole_mean) / width)
-    assert max(evidence_errors) < 0.05  # nats
+    assert max(evidence_errors) < 0.08  # nats
     assert np.median(evidence_errors) < 1e-3
     assert max(shifts) < 0.15  # of the posterior's standard deviation
     assert np.median(shifts) < 2e-3
