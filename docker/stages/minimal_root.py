@@ -8,6 +8,7 @@ binaries or of the environment's is linked with, root certificates, and the acco
 taken from, the licence and an entry in ``/var/lib/dpkg/status.d`` come along, where vulnerability scanners look.
 """
 
+import compileall
 import os
 import re
 import shutil
@@ -38,6 +39,7 @@ OTHER_FILES = (
     "/etc/group",
     "/etc/nsswitch.conf",
     "/etc/os-release",
+    "/etc/ld.so.conf",
     "/etc/ssl/certs/ca-certificates.crt",
 )
 
@@ -47,13 +49,17 @@ def main() -> None:
     make_folders(root)
     library = Path(sysconfig.get_path("stdlib"))
     interpreter = Path(sys.executable).resolve()
-    files = {*library_files(library), interpreter, *map(Path, OTHER_FILES)}
+    files = {*library_files(library), interpreter, *map(Path, OTHER_FILES), *Path("/etc/ld.so.conf.d").glob("*.conf")}
     binaries = [interpreter, *library.rglob("*.so*"), *venv.rglob("*.so*")]
     files |= linked_libraries(binaries)
     for link in python_links(venv):
         copy_link(root, link)
     for file in sorted(files):
         copy_file(root, file)
+    # Images of Python come without compiled modules, and the service's root is read-only: each start would compile.
+    compileall.compile_dir(root / real_folder(library) / library.name, stripdir=str(root), quiet=1)
+    # Libraries beside the system's own, in /usr/local/lib where images of Python have theirs, are found by this alone.
+    subprocess.run(["ldconfig", "-r", str(root)], check=True)
     if shutil.which("dpkg-query"):
         copy_package_entries(root, files)
 
