@@ -1,6 +1,8 @@
 """What a table knows of its site: stations, north, and the settings it was built with."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 
@@ -69,3 +71,8 @@ class SiteInfo:
     max_path_length: float
     stations: tuple[Station, ...]
     document: dict[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def station_by_id(self) -> Mapping[str, Station]:
+        """The stations by their identifiers."""
+        return {station.id: station for station in self.stations}

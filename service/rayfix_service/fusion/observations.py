@@ -100,7 +100,7 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
         For a station that the table does not have, a measurement sent twice, time differences that contradict each
         other, or too many measurements of one path whose errors are not Gaussian.
     """
-    stations = {station.id: station for station in site.stations}
+    stations = site.station_by_id
     drafts: dict[str, _Draft] = {}
     arrivals: list[Arrival] = []
     differences: list[Difference] = []
@@ -147,11 +147,11 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
                     )
                 )
     _refuse_repetitions(report)
-    clocks = [
-        [_unbiased(arrival, stations[arrival.station_id]) for arrival in clock]
-        for clock in (arrivals, *clocks_of_differences(differences))
-    ]
-    read = read_clocks(clocks, site.max_path_length)
+    clocks = [arrivals] if arrivals else []
+    if differences:
+        clocks += clocks_of_differences(differences)
+    unbiased = [[_unbiased(arrival, stations[arrival.station_id]) for arrival in clock] for clock in clocks]
+    read = read_clocks(unbiased, site.max_path_length)
     for arrival, reading in read.readings:
         drafts[arrival.station_id].readings.append((arrival, reading))
     observations = [observation for draft in drafts.values() for observation in _observations(draft)]
@@ -179,7 +179,8 @@ def _refuse_repetitions(report: Report) -> None:
     Two paths of a station may well be of one length, so a length may be repeated once for each of its angles. Time
     differences may be repeated: they say the same of the same arrivals.
     """
-    if len(set(report.measurements)) == len(report.measurements):
+    kinds = {(type(measurement), measurement.station_id) for measurement in report.measurements}
+    if len(kinds) == len(report.measurements) or len(set(report.measurements)) == len(report.measurements):
         return
     paths: defaultdict[str, int] = defaultdict(int)
     for measurement in report.measurements:
