@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.axes import semi_axes
-from rayfix_service.fusion.kernels import cholesky
+from rayfix_service.fusion.kernels import cholesky, log_sum
 from rayfix_service.fusion.selection import nth_smallest
 from rayfix_service.fusion.voxels import is_free
 from rayfix_tables.freespace import FreeSpace
@@ -152,9 +152,8 @@ def posterior_points(
         All n of them when none is in the free space.
     """
     places = np.empty_like(normal_points)
-    weight = np.exp(log_weight - log_weight.max())
     count = _spread(
-        weight / weight.sum(),
+        log_weight,
         mean,
         cov,
         free_space.origin,
@@ -237,9 +236,10 @@ def _squared_distances(points: Any, centre: Any, cov: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _spread(
-    weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any, normal_points: Any, places: Any
+    log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any, normal_points: Any, places: Any
 ) -> Any:
     """Fill ``places`` and tell how many there are."""
+    weight = np.exp(log_weight - log_sum(log_weight))
     lower = np.zeros((3, 3))
     x0, y0, z0 = origin
     total = len(normal_points)

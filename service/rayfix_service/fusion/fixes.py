@@ -4,10 +4,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rayfix_service.fusion.beam import Hypotheses
 from rayfix_service.fusion.credible import CredibleRegions, posterior_points
+from rayfix_service.fusion.kernels import log_sum
 from rayfix_service.fusion.modes import cut_to_free_space, find_modes
 from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.outliers import outlier_probabilities
@@ -67,10 +67,10 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
         free_space = table.scene.free_space
         gaussians = hypotheses.log_weight, hypotheses.mean, hypotheses.cov
         log_weight, mean, cov = cut_to_free_space(*gaussians, free_space, unit_points())
-        log_sum = _log_sum(log_weight)
-        log_evidence = _log_sum(np.array([log_sum, hypotheses.log_lost]))
+        log_found = log_sum(log_weight)
+        log_evidence = float(np.logaddexp(log_found, hypotheses.log_lost))
         lost = math.exp(hypotheses.log_lost - log_evidence)
-        log_weight -= log_sum
+        log_weight -= log_found
         keep = log_weight > math.log(settings.hypothesis_floor)
         modes = find_modes(log_weight[keep], mean[keep], cov[keep], free_space)
         candidates = tuple(
@@ -117,8 +117,3 @@ def _status(candidates: tuple[Candidate, ...], half_bad: float, settings: Fusion
     most, cov = settings.insufficient_above**2, candidates[0].covariance
     narrow = float(cov.trace()) <= most or float(np.linalg.eigvalsh(cov)[-1]) <= most
     return "ok" if narrow else "insufficient"
-
-
-def _log_sum(values: NDArray[np.float64]) -> float:
-    top = float(values.max())
-    return top + math.log(float(np.exp(values - top).sum()))

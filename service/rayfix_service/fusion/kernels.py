@@ -7,6 +7,16 @@ import numpy as np
 
 
 @numba.njit(cache=True, nogil=True)
+def log_sum(values: Any) -> Any:
+    """Logarithm of the sum of numbers that are given by their logarithms."""
+    top = values.max()
+    total = 0.0
+    for n in range(len(values)):
+        total += np.exp(values[n] - top)
+    return top + np.log(total)
+
+
+@numba.njit(cache=True, nogil=True)
 def cholesky(matrix: Any, lower: Any) -> Any:
     """Cholesky factor into ``lower``; False when the matrix is not positive definite."""
     size = len(matrix)
