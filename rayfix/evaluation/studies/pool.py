@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -16,7 +17,7 @@ from rayfix.evaluation.studies.cases import Case
 from rayfix.evaluation.studies.summary import Run
 from rayfix_tables.errors import RayfixError
 
-__all__ = ["Done", "Task", "run_tasks"]
+__all__ = ["Done", "Task", "end_with_parent", "run_tasks"]
 
 _CHUNK = 10
 """Drops that a process gets at a time."""
@@ -117,8 +118,21 @@ def _spread(pool: ProcessPoolExecutor, tasks: Sequence[Task], advance: Callable[
             yield Done(task=tasks[number], run=run, seconds=np.concatenate([seconds for _, seconds in found]))
 
 
+def end_with_parent() -> None:
+    """End this process when the one that started it has ended, however that was: nobody waits for its results then."""
+
+    def watch() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def _start(settings: BenchSettings) -> None:
     global _bench
+    end_with_parent()
     threadpool_limits(limits=1)
     _bench = Bench(settings)
 
