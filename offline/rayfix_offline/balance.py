@@ -64,7 +64,7 @@ def balanced(level: Level, free_space: FreeSpace) -> Level:
         share = _shares(weight, places, points, blocks)
         ratio = np.where(share > 0.0, 1.0 / np.clip(share, 1.0 / _MOST, _MOST), 1.0)
         gain = np.empty(len(weight))
-        _gather(places.mean, places.root, points, blocks, ratio, gain)
+        _gather(places.mean, places.root, points, *blocks.voxels, ratio, gain)
         weight *= gain
         log_balance += np.log(gain)
     return replace(level, log_balance=log_balance.astype(np.float32))
@@ -123,6 +123,11 @@ class _Blocks(NamedTuple):
     free: NDArray[np.bool_]
     side: int
     volume: Array
+
+    @property
+    def voxels(self) -> tuple[Array, float, NDArray[np.bool_], int]:
+        """What the kernels need."""
+        return self.origin, self.voxel_size, self.free, self.side
 
 
 def _places(level: Level) -> _Places:
@@ -186,45 +191,66 @@ def _blocks(free_space: FreeSpace) -> _Blocks:
 
 def _shares(weight: Array, places: _Places, points: Array, blocks: _Blocks) -> Array:
     mass = np.zeros_like(blocks.volume)
-    _spread(weight, places.mean, places.root, points, blocks, mass)
+    _spread(weight, places.mean, places.root, points, *blocks.voxels, mass)
     return np.divide(mass, blocks.volume, out=np.zeros_like(mass), where=blocks.volume > 0.0)
 
 
 @numba.njit(cache=True, nogil=True)
-def _block_of(mean: Any, root: Any, point: Any, blocks: Any) -> Any:
-    """Block of a point of a component, counted from 0 in C order; -1 for a place that is not free."""
-    nx, ny, nz = blocks.free.shape
-    x, y, z = mean[0] - blocks.origin[0], mean[1] - blocks.origin[1], mean[2] - blocks.origin[2]
-    x += root[0, 0] * point[0]
-    y += root[1, 0] * point[0] + root[1, 1] * point[1]
-    z += root[2, 0] * point[0] + root[2, 1] * point[1] + root[2, 2] * point[2]
-    i, j, k = np.floor(x / blocks.voxel_size), np.floor(y / blocks.voxel_size), np.floor(z / blocks.voxel_size)
-    if not (0 <= i < nx and 0 <= j < ny and 0 <= k < nz and blocks.free[int(i), int(j), int(k)]):
+def _block_of(x: Any, y: Any, z: Any, free: Any, side: Any, shape: Any) -> Any:
+    """Block of a place, counted from 0 in C order; -1 for one that is not free; coordinates are in voxels."""
+    nx, ny, nz = free.shape
+    i, j, k = np.floor(x), np.floor(y), np.floor(z)
+    if not (0 <= i < nx and 0 <= j < ny and 0 <= k < nz and free[int(i), int(j), int(k)]):
         return -1
-    _, ny, nz = blocks.volume.shape
-    return (int(i) // blocks.side * ny + int(j) // blocks.side) * nz + int(k) // blocks.side
+    return (int(i) // side * shape[1] + int(j) // side) * shape[2] + int(k) // side
 
 
 @numba.njit(cache=True, nogil=True)
-def _spread(weight: Any, mean: Any, root: Any, points: Any, blocks: Any, mass: Any) -> None:
+def _blocks_of(mean: Any, root: Any, points: Any, origin: Any, voxel_size: Any, free: Any, side: Any, out: Any) -> None:
+    """Blocks of a component's points."""
+    shape = (0, -(-free.shape[1] // side), -(-free.shape[2] // side))
+    x0, y0, z0 = mean[0] - origin[0], mean[1] - origin[1], mean[2] - origin[2]
+    xx, yx, yy, zx, zy, zz = root[0, 0], root[1, 0], root[1, 1], root[2, 0], root[2, 1], root[2, 2]
+    for n in range(len(points)):
+        p, q, r = points[n, 0], points[n, 1], points[n, 2]
+        x, y, z = x0 + xx * p, y0 + (yx * p + yy * q), z0 + (zx * p + zy * q + zz * r)
+        out[n] = _block_of(x / voxel_size, y / voxel_size, z / voxel_size, free, side, shape)
+
+
+@numba.njit(cache=True, nogil=True)
+def _spread(
+    weight: Any, mean: Any, root: Any, points: Any, origin: Any, voxel_size: Any, free: Any, side: Any, mass: Any
+) -> None:
     """Add the components' weights to the blocks that their points are in."""
     flat = mass.reshape(-1)
+    blocks = np.empty(len(points), np.int64)
     for n in range(len(weight)):
         each = weight[n] / len(points)
-        for point in points:
-            block = _block_of(mean[n], root[n], point, blocks)
+        _blocks_of(mean[n], root[n], points, origin, voxel_size, free, side, blocks)
+        for block in blocks:
             if block >= 0:
                 flat[block] += each
 
 
 @numba.njit(cache=True, nogil=True)
-def _gather(mean: Any, root: Any, points: Any, blocks: Any, values: Any, out: Any) -> None:
+def _gather(
+    mean: Any,
+    root: Any,
+    points: Any,
+    origin: Any,
+    voxel_size: Any,
+    free: Any,
+    side: Any,
+    values: Any,
+    out: Any,
+) -> None:
     """Means of a block's values over the free points of each component; 1 where none is free."""
     flat = values.reshape(-1)
+    blocks = np.empty(len(points), np.int64)
     for n in range(len(mean)):
         total, count = 0.0, 0
-        for point in points:
-            block = _block_of(mean[n], root[n], point, blocks)
+        _blocks_of(mean[n], root[n], points, origin, voxel_size, free, side, blocks)
+        for block in blocks:
             if block >= 0:
                 total += flat[block]
                 count += 1
