@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from rayfix_tables.conditioning import LOG_2PI, condition_on_angle
 from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.level import WINDOW_RATIO, Level
+from rayfix_tables.level import UNBALANCED, WINDOW_RATIO, Level
 from rayfix_tables.normal import normal_points
 
 _ROUNDS = 3
@@ -54,7 +54,7 @@ def balanced(level: Level, free_space: FreeSpace) -> Level:
         Of the scene that the level was made for.
     """
     if not len(level.mixture):
-        return replace(level, log_balance=np.zeros(0, np.float32))
+        return replace(level, log_balance=UNBALANCED)
     places = _places(level)
     points = np.array(normal_points(_NUM_POINTS))
     blocks = _blocks(free_space)

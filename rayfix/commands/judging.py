@@ -32,7 +32,7 @@ def add_commands(add: AddCommand) -> None:
     evaluate.add_argument("site", type=Path, metavar="SITE.toml")
     evaluate.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the report")
     evaluate.add_argument("--table", type=Path, metavar="T.h5", help="the site's table (default: it is built)")
-    evaluate.add_argument("--quick", action="store_true", help="few drops: some minutes instead of an hour")
+    evaluate.add_argument("--quick", action="store_true", help="few drops: some minutes instead of half an hour")
     evaluate.add_argument(
         "--drops", type=drop_count, metavar="N", help="drops of each study instead of the usual numbers"
     )

@@ -12,6 +12,10 @@ from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 WINDOW_RATIO = 1.25
 """A window's standard deviation is at least this times that of a measurement it serves."""
 
+UNBALANCED: NDArray[np.float32] = np.zeros(0, np.float32)
+"""The ``log_balance`` of a level that is not balanced; read-only like a mapped one, for which kernels are compiled."""
+UNBALANCED.flags.writeable = False
+
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
@@ -37,7 +41,7 @@ class Level:
     cell_offsets: NDArray[np.int64]
     cell_log_mass: NDArray[np.float64]
     mixture: TubeMixture
-    log_balance: NDArray[Any] = field(default_factory=lambda: np.zeros(0, np.float32))
+    log_balance: NDArray[Any] = field(default_factory=lambda: UNBALANCED)
 
     @property
     def num_cells(self) -> int:

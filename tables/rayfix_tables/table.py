@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError, TableError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
-from rayfix_tables.level import Level
+from rayfix_tables.level import UNBALANCED, Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 from rayfix_tables.schema import (
     CELL_CHANGE,
@@ -228,7 +228,7 @@ def _read_level(group: h5py.Group, mapped: NDArray[np.uint8]) -> Level:
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{group.name}/{name} has the shape {arrays[name].shape}, not {shape}")
-    log_balance = _map(group["log_balance"], LOG_BALANCE, mapped) if "log_balance" in group else np.zeros(0, np.float32)
+    log_balance = _map(group["log_balance"], LOG_BALANCE, mapped) if "log_balance" in group else UNBALANCED
     if len(log_balance) not in (0, len(mixture)):
         raise ValueError(f"{group.name}/log_balance has {len(log_balance)} entries, not {len(mixture)}")
     steps = np.diff(arrays["cell_offsets"], prepend=0, append=len(mixture))
