@@ -143,12 +143,8 @@ def _places(level: Level) -> _Places:
     mixture, count = level.mixture, len(level.mixture)
     weight = np.empty(count)
     mean, root = np.empty((count, 3), np.float32), np.empty((count, 3, 3), np.float32)
-    first = 0
-    while first < level.num_cells:
-        begin = int(level.cell_offsets[first])
-        last = int(np.searchsorted(level.cell_offsets, begin + _CHUNK, side="right")) - 1
-        last = max(last, first + 1)
-        end = int(level.cell_offsets[last])
+    for first, last in level.ranges(_CHUNK):
+        begin, end = int(level.cell_offsets[first]), int(level.cell_offsets[last])
         cells = slice(first, last)
         log_evidence, at, cov = np.empty(end - begin), np.empty((end - begin, 4)), np.empty((end - begin, 4, 4))
         condition_on_angle(
@@ -169,7 +165,6 @@ def _places(level: Level) -> _Places:
         )
         weight[begin:end], mean[begin:end] = np.exp(log_evidence), at[:, :3]
         root[begin:end] = np.linalg.cholesky(cov[:, :3, :3] + _THIN * np.eye(3))
-        first = last
     return _Places(weight, mean, root)
 
 

@@ -1,5 +1,6 @@
 """A level: all cells of one station at one window."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -52,6 +53,16 @@ class Level:
     def num_components(self) -> int:
         """Number of components over all cells."""
         return len(self.mixture)
+
+    def ranges(self, most: int) -> Iterator[tuple[int, int]]:
+        """Cut the cells into ranges, from the first to before the last, of ``most`` components or of one cell."""
+        first = 0
+        while first < self.num_cells:
+            begin = int(self.cell_offsets[first])
+            last = int(np.searchsorted(self.cell_offsets, begin + most, side="right")) - 1
+            last = max(last, first + 1)
+            yield first, last
+            first = last
 
     def cell(self, index: int) -> TubeMixture:
         """Components of one cell."""

@@ -134,6 +134,16 @@ def test_a_cell_is_its_slice_of_the_components(make_content: Callable[..., Any],
     assert_same_bits(joined, written.mixture.u_mean)
 
 
+def test_ranges_of_cells_are_all_cells_in_order(make_content: Callable[..., Any]) -> None:
+    level = make_content(3).stations[0].levels[0]
+    counts = np.diff(level.cell_offsets)
+    for most in (1, 4, 10**6):
+        ranges = list(level.ranges(most))
+        assert [first for first, _ in ranges] == [0, *(last for _, last in ranges[:-1])]
+        assert ranges[-1][1] == level.num_cells
+        assert all(counts[first:last].sum() <= most or last == first + 1 for first, last in ranges)
+
+
 def test_a_table_written_before_there_were_biases_has_none(small_table_path: Path, tmp_path: Path) -> None:
     path = tmp_path / "former.h5"
     path.write_bytes(small_table_path.read_bytes())

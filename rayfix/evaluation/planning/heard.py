@@ -76,12 +76,8 @@ def heard_paths(level: Level, places: Array) -> HeardPaths:
     jacobian = np.zeros((len(places), 3, 3))
     solid_angle = np.repeat(level.grid.solid_angles, level.grid.ring_cells)
     log_mass = np.asarray(level.cell_log_mass, np.float64)
-    first = 0
-    while first < level.num_cells:
-        begin = int(level.cell_offsets[first])
-        last = int(np.searchsorted(level.cell_offsets, begin + _CHUNK, side="right")) - 1
-        last = max(last, first + 1)
-        end = int(level.cell_offsets[last])
+    for first, last in level.ranges(_CHUNK):
+        begin, end = int(level.cell_offsets[first]), int(level.cell_offsets[last])
         part = level.mixture[begin:end]
         _search(
             first,
@@ -100,7 +96,6 @@ def heard_paths(level: Level, places: Array) -> HeardPaths:
             u_mean,
             jacobian,
         )
-        first = last
     back = np.argsort(order, kind="stable")
     return _as_paths(level, cell[back], total[back], u[back], u_mean[back], jacobian[back])
 
