@@ -36,6 +36,16 @@ def test_a_real_server_answers_and_ends(hall_table_path: Path):
                 refusal = http.post("/v1/positions", content=body, headers={"content-type": "application/json"})
                 assert refusal.status_code == refusal.json()["status"] == status
                 assert refusal.headers["content-type"] == "application/problem+json"
+        # Head and body of an answer arrive together, and answers to requests that were sent at once in their order.
+        with socket.create_connection(("127.0.0.1", server.port)) as connection:
+            for number in range(3):
+                connection.sendall(_posted_report(f"alone-{number}"))
+                assert connection.recv(1 << 16).endswith(b"}")
+            connection.sendall(_posted_report("first") + _posted_report("second"))
+            answers = b""
+            while len(found := re.findall(rb"x-request-id: (\w+)", answers)) < 2:
+                answers += connection.recv(1 << 16)
+            assert found == [b"first", b"second"]
         # A client that leaves within its body is no error, and one that leaves its batch ends that.
         batch = json.dumps({"reports": [REPORT] * 1000})
         for path, length, body in [
@@ -53,6 +63,12 @@ def test_a_real_server_answers_and_ends(hall_table_path: Path):
     assert "Traceback" not in log
     assert "ERROR" not in log
     assert "Application shutdown complete" in log
+
+
+def _posted_report(identifier: str) -> bytes:
+    body = json.dumps(REPORT)
+    head = ["POST /v1/positions HTTP/1.1", "Host: x", "Content-Type: application/json", f"X-Request-ID: {identifier}"]
+    return "\r\n".join([*head, f"Content-Length: {len(body)}", "", body]).encode()
 
 
 @pytest.mark.slow
@@ -160,9 +176,9 @@ def test_what_only_this_machine_reaches():
 
 def test_what_cannot_be_served_is_said_first(hall_table_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(TableError, match="nowhere"):
-        serve(tmp_path / "nowhere.h5")
+        serve(tmp_path / "nowhere.h5", port=0)
     with pytest.raises(NotATableError):
-        serve(Path(__file__))
+        serve(Path(__file__), port=0)
     with pytest.raises(ServiceError, match="workers is 0; give at least 1"):
         serve(hall_table_path, workers=0)
     with pytest.raises(ServiceError, match="port is 70000; give one from 0 to 65535"):
@@ -178,7 +194,7 @@ def test_what_cannot_be_served_is_said_first(hall_table_path: Path, tmp_path: Pa
         (tmp_path / "empty").write_text("# none yet\n")
         (tmp_path / "wrong").write_text("\nsecret\n")
         with pytest.raises(ServiceError, match=text):
-            serve(hall_table_path, settings=ServiceSettings(api_keys=tmp_path / keys))
+            serve(hall_table_path, port=0, settings=ServiceSettings(api_keys=tmp_path / keys))
     monkeypatch.setenv(MULTIPROCESS_VARIABLE, str(tmp_path / "nowhere"))
     with pytest.raises(ServiceError, match="nowhere, where figures cannot be written"):
         serve(hall_table_path, port=0)

@@ -21,6 +21,7 @@ from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.keys import read_key_file
 from rayfix_service.http.logs import LogFormat, log_config
 from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE, share_figures
+from rayfix_service.http.protocol import GatheringProtocol
 from rayfix_service.http.rates import Accounts
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.tables import forget_changed, load_tables
@@ -99,6 +100,7 @@ def serve(
             factory=True,
             host=host,
             port=port,
+            http=GatheringProtocol,
             ws_max_size=_MAX_MESSAGE,
             ws_per_message_deflate=False,  # costs more than it saves, on messages of a kilobyte
             timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
