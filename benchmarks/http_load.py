@@ -4,10 +4,10 @@
     python benchmarks/http_load.py hall.h5 --memory 200000
     python benchmarks/http_load.py hall.h5 --steady 15 [--rate 100]
 
-The load comes from `wrk` (Debian package wrk) over 16 connections on loopback. Both servers are uvicorn, on uvloop and
-with httptools; the plain one is started by uvicorn's command, validates the same report with the same models and answers
-with the example of a fix. They take turns, and the medians of the rounds are compared, since other work on the machine
-slows both. The processor time that each server takes for a request is less disturbed by it.
+The load comes from `wrk` (Debian package wrk) over 16 connections on loopback. Both servers are uvicorn, on uvloop
+and with httptools; the plain one is started by uvicorn's command, validates the same report with the same models and
+answers with the example of a fix. They take turns, and the medians of the rounds are compared, since other work on the
+machine slows both. The processor time that each server takes for a request is less disturbed by it.
 
 `--memory` loads one process as fast as it goes, `--steady` several for minutes at a moderate rate with reports of all
 kinds; both print the memory of the service's processes.
