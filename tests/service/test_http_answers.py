@@ -9,6 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
+from rayfix_service.http.locating import Answerer, Incoming
 from rayfix_service.http.problems import Problem
 from rayfix_service.wire import FixDocument
 from rayfix_tables.table import Table
@@ -63,6 +64,29 @@ def test_metres_and_nanoseconds_get_the_same_fix(hall_app: RunningApp):
 def test_json_by_any_of_its_names_is_taken(hall_app: RunningApp, content_type: str):
     body = json.dumps(REPORT).encode()
     assert hall_app.post_bytes("/v1/positions", body, {"content-type": content_type}).status_code == 200
+
+
+def test_reports_that_came_together_take_each_step_together(hall_app: RunningApp, monkeypatch: pytest.MonkeyPatch):
+    steps = []
+    locate, write = Answerer.locate, Answerer.write
+
+    async def noting_locate(self: Answerer, table: Any, incoming: Incoming, wanted: Any) -> Any:
+        steps.append(("locate", incoming.report.target_id))
+        return await locate(self, table, incoming, wanted)
+
+    def noting_write(self: Answerer, table: Any, incoming: Incoming, *rest: Any) -> Any:
+        steps.append(("write", incoming.report.target_id))
+        return write(self, table, incoming, *rest)
+
+    async def together() -> list[httpx.Response]:
+        reports = [REPORT | {"target_id": name} for name in "ab"]
+        return await asyncio.gather(*(hall_app.http.post("/v1/positions", json=report) for report in reports))
+
+    monkeypatch.setattr(Answerer, "locate", noting_locate)
+    monkeypatch.setattr(Answerer, "write", noting_write)
+    answers = hall_app.run(together())
+    assert steps == [("locate", "a"), ("locate", "b"), ("write", "a"), ("write", "b")]
+    assert [answer.json()["target_id"] for answer in answers] == ["a", "b"]
 
 
 def test_a_batch_is_answered_in_its_order(hall_app: RunningApp):

@@ -6,11 +6,16 @@ from pydantic_core import to_json
 from starlette.responses import Response
 
 
+def write_json(document: Any) -> bytes:
+    """Write plain dicts, lists, texts and numbers as JSON; what is not finite becomes null, as JSON has none."""
+    return to_json(document, inf_nan_mode="null")
+
+
 class JsonAnswer(Response):
-    """A JSON document of plain dicts, lists, texts and numbers; what is not finite becomes null, as JSON has none."""
+    """A JSON document, as :func:`write_json` writes it."""
 
     media_type = "application/json"
 
     def render(self, content: Any) -> bytes:
         """Write the document."""
-        return to_json(content, inf_nan_mode="null")
+        return write_json(content)

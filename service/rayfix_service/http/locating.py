@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, NamedTuple
 
 from fastapi import Depends
 from pydantic_core import from_json, to_json
@@ -14,6 +14,7 @@ from starlette.requests import HTTPConnection
 from rayfix_service.adapters.adapted import Adapted, error_in_message
 from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.omlox_hub import OmloxHub
+from rayfix_service.fusion.locator import Fused
 from rayfix_service.fusion.report import Fix, Report
 from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.metrics import Metrics
@@ -26,8 +27,6 @@ from rayfix_service.wire import fix_to_document, parse_report, report_to_documen
 from rayfix_tables.errors import ReportError
 
 _log = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +69,14 @@ def foreign(adapted: Adapted) -> Incoming:
     return Incoming(report=adapted.report, adapted=adapted)
 
 
+class Located(NamedTuple):
+    """A fix, the track of its target if that is wanted, and the time that the fix took, s."""
+
+    fix: Fix
+    track: TrackedPosition | None
+    seconds: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Answerer:
     """What answers reports: the figures that it adds to, the feed and hub to tell, threads for slow ones."""
@@ -84,18 +91,51 @@ class Answerer:
 
         Raises
         ------
+        ReportError, ProblemError
+            As :meth:`locate` and :meth:`write` do.
+        """
+        return self.write(table, incoming, wanted, await self.locate(table, incoming, wanted))
+
+    async def locate(self, table: ServedTable, incoming: Incoming, wanted: Wanted) -> Located:
+        """Locate a report with a table, and follow its target if that is wanted.
+
+        A fix with an angle takes less than a millisecond or a few, right on the event loop. In the thread pool that
+        FastAPI has for "def" such fixes would wait for each other's GIL; more worker processes use more cores.
+
+        Raises
+        ------
         ReportError
-            When a station is not in the table, or the format needs a position and there is none.
+            When a station is not in the table, or the target cannot be followed.
         ProblemError
             When the fix is slow and the service too busy.
         """
+        report = incoming.report
+        locate: Callable[[Report], Fix | Fused] = table.locator.fuse if wanted.follows(report) else table.locator.locate
+        start = perf_counter()
         try:
-            fix, track, seconds = await self._locate(table, incoming.report, wanted)
+            found = await self.slow_fixes.locate(locate, report) if is_slow(report) else locate(report)
+            seconds = perf_counter() - start
+            fix = found.fix if isinstance(found, Fused) else found
+            self.metrics.fix_done(fix, seconds)
+            track = table.tracker.follow(found) if isinstance(found, Fused) else None
         except ReportError as error:
             if incoming.adapted is None:
                 raise
             raise error_in_message(error, incoming.adapted) from None
-        self.feed.publish(table.name, fix.target_id, partial(_event, table.name, incoming, fix, track, seconds))
+        if track is not None:
+            self.metrics.track_done(track.state)
+        return Located(fix, track, seconds)
+
+    def write(self, table: ServedTable, incoming: Incoming, wanted: Wanted, located: Located) -> dict[str, Any]:
+        """Tell who listens of a fix, and write the answer as wanted.
+
+        Raises
+        ------
+        ReportError
+            When the format needs a position and there is none.
+        """
+        fix, track, seconds = located
+        self.feed.publish(table.name, fix.target_id, partial(_event, table.name, incoming, located))
         site = table.site
         if self.hub is not None:
             self.hub.tell(fix, site, track)
@@ -116,37 +156,11 @@ class Answerer:
             _log.exception("a report of several failed")
             return internal_problem()
 
-    async def _locate(
-        self, table: ServedTable, report: Report, wanted: Wanted
-    ) -> tuple[Fix, TrackedPosition | None, float]:
-        """Locate a report; returns the fix, its target's track if that is wanted, and the time of the fix, s.
 
-        A fix with an angle takes less than a millisecond or a few, right on the event loop. In the thread pool that
-        FastAPI has for "def" such fixes would wait for each other's GIL; more worker processes use more cores.
-        """
-        start = perf_counter()
-        if not wanted.follows(report):
-            fix = await self._wherever(table.locator.locate, report)
-            seconds = perf_counter() - start
-            self.metrics.fix_done(fix, seconds)
-            return fix, None, seconds
-        fused = await self._wherever(table.locator.fuse, report)
-        seconds = perf_counter() - start
-        self.metrics.fix_done(fused.fix, seconds)
-        track = table.tracker.follow(fused)
-        if track is not None:
-            self.metrics.track_done(track.state)
-        return fused.fix, track, seconds
-
-    async def _wherever(self, locate: Callable[[Report], T], report: Report) -> T:
-        """Locate on the event loop, or in a thread what would take too long there."""
-        return await self.slow_fixes.locate(locate, report) if is_slow(report) else locate(report)
-
-
-def _event(table: str, incoming: Incoming, fix: Fix, track: TrackedPosition | None, seconds: float) -> bytes:
+def _event(table: str, incoming: Incoming, located: Located) -> bytes:
     """Write what the feed tells of a fix."""
-    document = {"table": table, "report": incoming.native_document(), "fix": fix_to_document(fix, seconds, track)}
-    return to_json(document)
+    fix = fix_to_document(located.fix, located.seconds, located.track)
+    return to_json({"table": table, "report": incoming.native_document(), "fix": fix})
 
 
 async def get_answerer(connection: HTTPConnection) -> Answerer:
