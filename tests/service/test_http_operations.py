@@ -1,5 +1,7 @@
 """What whoever runs the service sees: figures, request identifiers, logs."""
 
+import asyncio
+import contextlib
 import io
 import json
 import logging
@@ -17,7 +19,7 @@ from rayfix_service.fusion.report import Fix, Outcome
 from rayfix_service.http.examples import BATCH_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.http.logs import JsonFormatter, log_config
 from rayfix_service.http.metrics import Metrics
-from rayfix_service.http.request_context import ACCESS_LOGGER, REQUEST_ID
+from rayfix_service.http.request_context import ACCESS_LOGGER, REQUEST_ID, RequestContext
 from rayfix_tables.table import Table
 from tests.support.reports import REPORT
 from tests.support.running_app import RunningApp
@@ -171,12 +173,13 @@ def test_an_id_that_is_unfit_for_a_log_is_replaced(service: RunningApp, unfit: A
     assert re.fullmatch("[0-9a-f]{32}", response.headers["x-request-id"])
 
 
-def test_a_defect_is_logged_with_its_request(
-    service: RunningApp, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+@pytest.mark.parametrize("query", ["", "?output=native"])  # past the router, and by it
+def test_a_defect_is_logged_with_its_request(service: RunningApp, monkeypatch: pytest.MonkeyPatch, query: str):
     def fail(self: Locator, report: Any) -> Any:
         raise RuntimeError("a defect")
 
+    counted = ("rayfix_http_requests_total", "POST", "/v1/positions", "500")
+    before = figures_of(service).get(counted, 0)
     monkeypatch.setattr(Locator, "locate", fail)
     log = io.StringIO()
     handler = logging.StreamHandler(log)
@@ -184,18 +187,48 @@ def test_a_defect_is_logged_with_its_request(
     logger = logging.getLogger("rayfix_service")
     logger.addHandler(handler)
     try:
-        response = service.post("/v1/positions", REPORT, headers={"x-request-id": "r-9"})
+        response = service.post(f"/v1/positions{query}", REPORT, headers={"x-request-id": "r-9"})
     finally:
         logger.removeHandler(handler)
-    assert response.status_code == 500
+    assert response.status_code == response.json()["status"] == 500
+    assert response.headers["content-type"] == "application/problem+json"
     assert response.headers["x-request-id"] == "r-9"
     (entry,) = map(json.loads, log.getvalue().splitlines())
     assert (entry["level"], entry["request_id"]) == ("ERROR", "r-9")
     assert entry["message"] == "request POST /v1/positions failed"
     assert "RuntimeError: a defect" in entry["exception"]
     assert REQUEST_ID.get() is None
-    figures = figures_of(service)
-    assert figures["rayfix_http_requests_total", "POST", "/v1/positions", "500"] == 1
+    assert figures_of(service)[counted] == before + 1
+
+
+@pytest.mark.parametrize(
+    ("sent", "raised"),
+    [
+        (1, True),  # the client must see the connection end, not an answer that is whole
+        (2, False),
+    ],
+)
+def test_a_defect_after_an_answer_has_begun(sent: int, raised: bool, caplog: pytest.LogCaptureFixture):
+    answer = [{"type": "http.response.start", "status": 200}, {"type": "http.response.body", "body": b"{}"}]
+    scope = {"type": "http", "method": "GET", "path": "/", "headers": []}
+    received = []
+
+    async def fail(scope: Any, receive: Any, send: Any) -> None:
+        for message in answer[:sent]:
+            await send(message)
+        raise RuntimeError("a defect")
+
+    async def receive() -> Any:
+        raise AssertionError
+
+    async def send(message: Any) -> None:
+        received.append(message["type"])
+
+    context = RequestContext(fail, metrics=Metrics())
+    with pytest.raises(RuntimeError) if raised else contextlib.nullcontext():
+        asyncio.run(context(scope, receive, send))
+    assert received == [message["type"] for message in answer[:sent]]
+    assert len(caplog.records) == (0 if raised else 1)  # what is raised, the server logs
 
 
 def test_a_line_per_request_is_written_on_demand(service: RunningApp, caplog: pytest.LogCaptureFixture):

@@ -175,6 +175,11 @@ async def _answer_http(request: Request, error: Exception) -> JSONResponse:
     return problem_response(problem_document(kind, str(error.detail)), error.headers)
 
 
+async def _answer_defect(request: Request, error: Exception) -> JSONResponse:
+    """Answer what nobody else does; the application's outermost middleware logs it."""
+    return problem_response(internal_problem())
+
+
 def install_problems(app: FastAPI) -> None:
     """Make every error that the routes of `app` raise a problem document."""
     app.add_exception_handler(ProblemError, _answer_error)
@@ -182,3 +187,4 @@ def install_problems(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _answer_validation)
     app.add_exception_handler(WebSocketRequestValidationError, _answer_validation)  # before the handshake
     app.add_exception_handler(HTTPException, _answer_http)
+    app.add_exception_handler(Exception, _answer_defect)

@@ -52,6 +52,10 @@ class GatheringTransport:
         self._flush()
         self._transport.write_eof()
 
+    def is_closing(self) -> bool:
+        """Whether the connection is closed or about to be."""
+        return self._transport.is_closing()
+
     def close(self) -> None:
         """Write all, and close the connection."""
         self._flush()

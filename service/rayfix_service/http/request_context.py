@@ -32,8 +32,8 @@ class RequestContext:
     """Middleware around all others.
 
     It gives each request an identifier, the client's own if it sent a proper one, and echoes it; counts the request and
-    logs it; and turns an exception that nobody handled into a problem, logged once. A handler for Exception would do
-    that too, but Starlette raises the exception again after it, and the server logs it a second time.
+    logs it; and logs an exception that nobody handled, once, with a problem for answer unless there is one. Starlette
+    answers those of routes by the handler for Exception and raises them again; the server would log them then.
     """
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
@@ -48,13 +48,15 @@ class RequestContext:
             await self._app(scope, receive, send)
             return
         identifier = self._identifier(scope)
-        status = 0
+        status, answered = 0, False
 
         async def send_noting(message: Message) -> None:
-            nonlocal status
+            nonlocal status, answered
             if message["type"] == "http.response.start":
                 status = message["status"]
                 message["headers"] = [*message.get("headers", ()), (_RAW_HEADER, identifier.encode())]
+            elif message["type"] == "http.response.body":
+                answered = not message.get("more_body", False)
             await send(message)
 
         token = REQUEST_ID.set(identifier)
@@ -62,10 +64,11 @@ class RequestContext:
         try:
             await self._app(scope, receive, send_noting)
         except Exception:
-            if status:
+            if status and not answered:
                 raise  # only the server can cut the connection, and it logs
             _log.exception("request %s %s failed", scope["method"], scope["path"])
-            await problem_response(internal_problem())(scope, receive, send_noting)
+            if not status:
+                await problem_response(internal_problem())(scope, receive, send_noting)
         finally:
             self._note(scope, str(status or "none"), perf_counter() - start, identifier)
             REQUEST_ID.reset(token)
