@@ -128,7 +128,6 @@ def changes_of(
     log_weight, mean, cov = exhaustive(factors, sorted_report.num_clocks, prior, math.log(longest))
     found = multiply(
         factors,
-        num_clocks=sorted_report.num_clocks,
         max_path_length=longest,
         prior=prior,
         width=DEFAULT.beam_width,

@@ -17,6 +17,7 @@ from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.omlox import fix_to_omlox
 from rayfix_service.adapters.threegpp import fix_to_3gpp
 from rayfix_service.fusion.credible import CredibleRegions
+from rayfix_service.fusion.points import ListedPoints
 from rayfix_service.fusion.report import Candidate, Fix, Outcome
 from rayfix_service.http.examples import LOCAL_3D_EXAMPLE, OMLOX_EXAMPLE
 from rayfix_service.http.outputs import Local3dPointUncertaintyEllipsoid, OmloxLocation
@@ -38,7 +39,7 @@ def a_fix(covariance: Any, *, share: float = 1.0, **more: Any) -> Fix:
     """Fix whose posterior is one Gaussian, but for the share that everything is an outlier."""
     position, cov = np.array([1.0, 2.0, 3.0]), np.array(covariance, dtype=float)
     points = position + normal_points(1024) @ np.linalg.cholesky(cov).T
-    regions = CredibleRegions(position=position, covariance=cov, points=points, share=share)
+    regions = CredibleRegions(position=position, covariance=cov, points=ListedPoints(position=points), share=share)
     candidate = Candidate(probability=share, position=position, covariance=cov)
     return Fix(
         status="ok", candidates=(candidate,), outcomes=(), log_evidence=0.0, table_id="id", regions=regions, **more
@@ -187,7 +188,7 @@ def a_track(timestamp: str = "2026-01-31T10:00:01Z") -> TrackedPosition:
         velocity_covariance=0.1 * np.eye(3),
     )
     points = position + normal_points(1024) @ np.sqrt(covariance)
-    regions = CredibleRegions(position=position, covariance=covariance, points=points, share=1.0)
+    regions = CredibleRegions(position=position, covariance=covariance, points=ListedPoints(position=points), share=1.0)
     return TrackedPosition(state="updated", timestamp=timestamp, num_reports=7, estimate=found, regions=regions)
 
 

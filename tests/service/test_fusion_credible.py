@@ -1,6 +1,7 @@
 """Credible regions: Gaussians in the open, several hills, walls, and what holds of any points."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from scipy.stats import chi2, norm
 from rayfix_service.fusion import reference
 from rayfix_service.fusion.axes import semi_axes
 from rayfix_service.fusion.beam import Hypotheses
-from rayfix_service.fusion.credible import CredibleRegions, Ellipsoid, posterior_points
+from rayfix_service.fusion.credible import CredibleRegions, Ellipsoid
+from rayfix_service.fusion.points import DrawnPoints, draw_points
 from rayfix_service.fusion.posterior import make_posterior
 from rayfix_service.fusion.prior import even_prior
 from rayfix_tables.freespace import FreeSpace
@@ -27,11 +29,18 @@ COV = np.array([[0.5, 0.2, 0.05], [0.2, 0.3, 0.1], [0.05, 0.1, 0.4]])
 SHARES = (0.5, 0.68, 0.9, 0.99)
 
 
+def points_of(log_weight: Array, mean: Array, cov: Array, free_space: FreeSpace) -> DrawnPoints:
+    """Points of a mixture of Gaussians."""
+    space = free_space.origin, free_space.voxel_size, free_space.free
+    drawn_mean, root, owner = draw_points(log_weight, mean, cov, POINTS, *space)
+    return DrawnPoints(mean=drawn_mean, root=root, owner=owner)
+
+
 def regions_of(
     log_weight: Array, mean: Array, cov: Array, free_space: FreeSpace = OPEN, *, share: float = 1.0
 ) -> CredibleRegions:
     """Regions around the first of some Gaussians."""
-    points = posterior_points(log_weight, mean, cov, free_space, POINTS)
+    points = points_of(log_weight, mean, cov, free_space)
     return CredibleRegions(position=mean[0], covariance=cov[0], points=points, share=share)
 
 
@@ -182,13 +191,13 @@ def test_behind_a_wall_there_is_nothing_to_hold() -> None:
     wall = FreeSpace(origin=np.full(3, -50.0), voxel_size=2.0, free=free)
     mean, cov = np.array([[-0.0, 0.0, 0.0]]), np.diag([1.0, 1e-4, 1e-4])[None]
     cut = regions_of(np.zeros(1), mean, cov, wall)
-    assert 0.49 < len(cut.points) / len(POINTS) < 0.51
-    assert (cut.points[:, 0] < 0.0).all()
+    assert 0.49 < len(cut.points.places()) / len(POINTS) < 0.51
+    assert (cut.points.places()[:, 0] < 0.0).all()
     assert cut.horizontal_radius(0.68) == pytest.approx(norm.ppf(0.84), rel=0.02)
     # With the middle one deviation in front of the wall, it is a normal cut at its 84 % quantile.
     moved = regions_of(np.zeros(1), mean - [1.0, 0.0, 0.0], cov, wall)
     uncut = regions_of(np.zeros(1), mean - [1.0, 0.0, 0.0], cov)
-    assert len(moved.points) / len(POINTS) == pytest.approx(norm.cdf(1.0), abs=0.005)
+    assert len(moved.points.places()) / len(POINTS) == pytest.approx(norm.cdf(1.0), abs=0.005)
     radius = moved.horizontal_radius(0.9)
     assert norm.cdf(1.0) - norm.cdf(-radius) == pytest.approx(0.9 * norm.cdf(1.0), abs=0.01)
     assert radius < uncut.horizontal_radius(0.9) - 0.05
@@ -197,7 +206,7 @@ def test_behind_a_wall_there_is_nothing_to_hold() -> None:
 def test_nothing_free_leaves_the_first_gaussian() -> None:
     nowhere = FreeSpace(origin=np.full(3, 90.0), voxel_size=2.0, free=np.ones((3, 3, 3), np.bool_))
     mean, cov = np.array([[0.0, 0.0, 1.0], [5.0, 0.0, 0.0]]), np.stack([COV, np.eye(3)])
-    points = posterior_points(np.log([0.6, 0.4]), mean, cov, nowhere, POINTS)
+    points = points_of(np.log([0.6, 0.4]), mean, cov, nowhere).places()
     assert points.shape == POINTS.shape
     np.testing.assert_allclose(points.mean(axis=0), mean[0], rtol=0, atol=0.01)
     np.testing.assert_allclose(np.cov(points.T), COV, rtol=0, atol=0.015)
@@ -210,7 +219,7 @@ def test_where_everything_may_be_an_outlier_regions_are_wider() -> None:
     assert doubtful.horizontal_radius(0.6) == pytest.approx(sure.horizontal_radius(0.75), rel=1e-9)
     widest = doubtful.ellipsoid(0.9)
     assert widest.probability == 0.8
-    assert held(widest, doubtful.points) >= 1.0 - 1.0 / len(POINTS)
+    assert held(widest, doubtful.points.places()) >= 1.0 - 1.0 / len(POINTS)
     np.testing.assert_allclose(widest.shape, doubtful.ellipsoid(0.99).shape, rtol=1e-12)
 
 
@@ -239,8 +248,8 @@ def test_more_probable_regions_are_larger(seed: int, probabilities: tuple[float,
         small, large = region(low), region(high)
         assert np.linalg.det(small.shape) <= np.linalg.det(large.shape) * (1.0 + 1e-12)
         # And holds its share of the points, one more or less.
-        inside = held(large, regions.points)
-        assert inside == pytest.approx(min(1.0, high / share), abs=2.0 / len(regions.points))
+        points = regions.points.places()
+        assert held(large, points) == pytest.approx(min(1.0, high / share), abs=2.0 / len(points))
 
 
 @settings(max_examples=25, deadline=None)
@@ -255,7 +264,7 @@ def test_regions_turn_with_the_scene(seed: int, probability: float) -> None:
         return CredibleRegions(
             position=matrix @ regions.position,
             covariance=matrix @ regions.covariance @ matrix.T,
-            points=regions.points @ matrix.T,
+            points=replace(regions.points, mean=regions.points.mean @ matrix.T, root=matrix @ regions.points.root),
             share=1.0,
         )
 
@@ -282,7 +291,7 @@ def test_points_are_those_of_the_twin(seed: int) -> None:
     cov[3, 0, 0] = -1e-9
     space = FreeSpace(origin=np.array([-4.0, -3.0, -3.0]), voxel_size=0.5, free=rng.random((16, 12, 12)) < 0.6)
     expected = reference.posterior_points(log_weight, mean, cov, space, POINTS)
-    found = posterior_points(log_weight, mean, cov, space, POINTS)
+    found = points_of(log_weight, mean, cov, space).places()
     assert 0.2 < len(found) / len(POINTS) < 0.6
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)  # m
     assert space.contains(found).all()
@@ -292,7 +301,9 @@ def test_each_gaussian_gets_its_share_of_points() -> None:
     weight = np.array([0.05, 0.6, 0.0, 0.35])
     mean = np.array([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0], [0.0, 20.0, 0.0], [0.0, 0.0, 20.0]])
     with np.errstate(divide="ignore"):
-        points = posterior_points(np.log(weight), mean, np.repeat(0.1 * np.eye(3)[None], 4, axis=0), OPEN, POINTS)
+        drawn = points_of(np.log(weight), mean, np.repeat(0.1 * np.eye(3)[None], 4, axis=0), OPEN)
+    assert len(drawn.mean) == 3
+    points = drawn.places()
     owner = np.argmin(np.linalg.norm(points[:, None] - mean, axis=2), axis=1)
     np.testing.assert_allclose(np.bincount(owner, minlength=4), weight * len(POINTS), rtol=0, atol=1.0)
 

@@ -161,7 +161,6 @@ def test_the_beam_finds_what_the_exhaustive_product_finds(hall: Hall, timing: Ti
         products = partial(
             multiply,
             factors,
-            num_clocks=num_clocks,
             max_path_length=hall.table.site.max_path_length,
             prior=even_prior(hall.table.scene.free_space),
         )

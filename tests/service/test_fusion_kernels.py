@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from rayfix_service.fusion import beam_kernels, factor_kernels, mode_kernels, natural, reference
+from rayfix_service.fusion import beam_kernels, factor_kernels, modes, natural, reference
+from rayfix_service.fusion.cutting import cut_to_free_space
 from rayfix_service.fusion.factor_kernels import ALL_GOOD
 from rayfix_service.fusion.factors import make_factor
 from rayfix_service.fusion.heard import HeardStation
@@ -267,7 +268,7 @@ def test_extend_beam_gives_up_hopeless_products() -> None:
     np.testing.assert_allclose(score, expected[hopeful], rtol=0, atol=1e-7)  # nats
 
 
-def test_cut_gaussians_equals_its_twin() -> None:
+def test_cutting_to_the_free_space_equals_its_twin() -> None:
     rng = np.random.default_rng(6)
     free_space = FreeSpace(origin=np.array([-1.0, 2.0, 0.5]), voxel_size=0.25, free=rng.random((10, 8, 6)) < 0.6)
     mean, cov = rng.uniform([-1.0, 2.0, 0.5], [1.5, 4.0, 2.0], (30, 3)), random_cov(rng, 30, [0.2, 0.1, 0.1])
@@ -278,14 +279,16 @@ def test_cut_gaussians_equals_its_twin() -> None:
     mean[2], cov[2] = [3.0, 3.0, 1.2], np.eye(3)
     points = unit_points()
     expected = [reference.cut_gaussian(m, c, points, free_space) for m, c in zip(mean, cov, strict=True)]
-    share = np.empty(30)
-    mode_kernels.cut_gaussians(mean, cov, points, free_space.origin, 0.25, free_space.free, share)
+    space = free_space.origin, 0.25, free_space.free
+    log_weight, cut_mean, cut_cov = cut_to_free_space(np.full(30, -2.0), mean, cov, points, *space)
+    share = np.array([e[2] for e in expected])
     assert share[0] == 1.0
     assert share[1] == 0.0
     assert 0 < share[2] * 128 <= 8
-    assert share.tolist() == [e[2] for e in expected]
-    np.testing.assert_allclose(mean, [e[0] for e in expected], rtol=0, atol=1e-12)  # m
-    np.testing.assert_allclose(cov, [e[1] for e in expected], rtol=0, atol=1e-12)  # m2
+    # What lies in a solid keeps a thousandth of its weight.
+    np.testing.assert_allclose(log_weight, -2.0 + np.log(np.maximum(share, 1e-3)), rtol=1e-14)
+    np.testing.assert_allclose(cut_mean, [e[0] for e in expected], rtol=0, atol=1e-12)  # m
+    np.testing.assert_allclose(cut_cov, [e[1] for e in expected], rtol=0, atol=1e-12)  # m2
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -295,7 +298,7 @@ def test_climb_equals_its_twin(seed: int) -> None:
     precision = np.asarray(np.linalg.inv(random_cov(rng, 20, [0.4, 0.6, 0.2])), np.float64)
     log_density = np.log(rng.dirichlet(np.ones(20))) + 0.5 * np.linalg.slogdet(precision)[1]
     for start in mean[:5]:
-        mode, curvature = mode_kernels.climb(log_density, mean, precision, start)
+        mode, curvature = modes.climb(log_density, mean, precision, start)
         expected_mode, expected_curvature = reference.climb(log_density, mean, precision, start)
         np.testing.assert_allclose(mode, expected_mode, rtol=0, atol=1e-7)  # m
         np.testing.assert_allclose(curvature, expected_curvature, rtol=1e-5)

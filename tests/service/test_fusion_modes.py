@@ -1,12 +1,14 @@
 """From hypotheses to candidates: cutting to the free space, climbing, gathering."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from rayfix_service.fusion import mode_kernels, reference
-from rayfix_service.fusion.modes import cut_to_free_space, find_modes
+from rayfix_service.fusion import modes, reference
+from rayfix_service.fusion.cutting import cut_to_free_space
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.normal import unit_points
 
@@ -25,8 +27,29 @@ def log_density(x: Array, weight: Array, mean: Array, cov: Array) -> Array:
 
 def climb_from(start: Array, weight: Array, mean: Array, cov: Array) -> Array:
     precision = np.linalg.inv(cov)
-    mode, _ = mode_kernels.climb(np.log(weight) + 0.5 * np.linalg.slogdet(precision)[1], mean, precision, start)
+    mode, _ = modes.climb(np.log(weight) + 0.5 * np.linalg.slogdet(precision)[1], mean, precision, start)
     return np.asarray(mode)
+
+
+class Hills(NamedTuple):
+    """What :func:`modes.find_hills` gives."""
+
+    probability: Array
+    position: Array
+    cov: Array
+    member: NDArray[np.int64]
+
+
+def hills_of(weight: Array, mean: Array, cov: Array, free_space: FreeSpace) -> Hills:
+    space = free_space.origin, free_space.voxel_size, free_space.free
+    return Hills(*modes.find_hills(np.log(weight), mean, cov, *space))
+
+
+def cut(mean: Array, cov: Array, free_space: FreeSpace) -> tuple[Array, Array, Array]:
+    """Cut Gaussians of weight 1."""
+    space = free_space.origin, free_space.voxel_size, free_space.free
+    log_weight, cut_mean, cut_cov = cut_to_free_space(np.zeros(len(mean)), mean, cov, unit_points(), *space)
+    return log_weight, cut_mean, cut_cov
 
 
 def random_mixture(seed: int, count: int) -> tuple[Array, Array, Array]:
@@ -52,7 +75,7 @@ def test_a_gaussian_at_a_wall_is_a_truncated_normal(wall: float) -> None:
         origin=np.array([wall * stdev - 50.0, -25.0, -25.0]), voxel_size=50.0, free=np.ones((1, 1, 1), np.bool_)
     )
     cov = np.diag([stdev**2, 0.04, 0.09])
-    log_weight, mean, cut = cut_to_free_space(np.zeros(1), np.zeros((1, 3)), cov[None], free_space, unit_points())
+    log_weight, mean, cut_cov = cut(np.zeros((1, 3)), cov[None], free_space)
     share = norm.cdf(wall)
     pull = norm.pdf(wall) / share
     assert np.exp(log_weight[0]) == pytest.approx(share, abs=0.04)
@@ -62,8 +85,8 @@ def test_a_gaussian_at_a_wall_is_a_truncated_normal(wall: float) -> None:
     expected = 0.9 * stdev**2 * (1.0 - wall * pull - pull**2) + 0.1 * stdev**2
     # A variance of n points strays by sqrt(2 / n).
     allowed = 2.0 * np.sqrt(2.0 / (128 * share))
-    assert cut[0, 0, 0] == pytest.approx(expected, rel=allowed)
-    np.testing.assert_allclose(np.diag(cut[0])[1:], [0.04, 0.09], rtol=allowed)
+    assert cut_cov[0, 0, 0] == pytest.approx(expected, rel=allowed)
+    np.testing.assert_allclose(np.diag(cut_cov[0])[1:], [0.04, 0.09], rtol=allowed)
     if wall <= 0.7:
         assert stdev * pull > 5.0 * error
 
@@ -75,7 +98,7 @@ def test_cutting_agrees_with_sampling_among_random_solids() -> None:
     free_space.free[22:] = False
     _, mean, cov = random_mixture(2, 20)
     mean, cov = 0.2 * mean, 0.04 * cov / np.trace(cov, axis1=1, axis2=2)[:, None, None]
-    log_weight, cut_mean, _ = cut_to_free_space(np.zeros(20), mean, cov, free_space, unit_points())
+    log_weight, cut_mean, _ = cut(mean, cov, free_space)
     for h in range(20):
         sample = rng.multivariate_normal(mean[h], cov[h], 100_000)
         free = free_space.contains(sample)
@@ -88,21 +111,21 @@ def test_cutting_agrees_with_sampling_among_random_solids() -> None:
 def test_far_hypotheses_are_candidates_of_their_own() -> None:
     weight, mean = np.array([0.3, 0.7]), np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 1.0]])
     cov = np.array([np.diag([0.1, 0.2, 0.3]), np.diag([0.3, 0.1, 0.1])])
-    modes = find_modes(np.log(weight), mean, cov, ANYWHERE)
-    np.testing.assert_allclose(modes.probability, [0.7, 0.3], rtol=1e-12)
-    np.testing.assert_allclose(modes.position, mean[::-1], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(modes.cov, cov[::-1], rtol=0, atol=1e-12)
-    assert modes.member.tolist() == [1, 0]
+    hills = hills_of(weight, mean, cov, ANYWHERE)
+    np.testing.assert_allclose(hills.probability, [0.7, 0.3], rtol=1e-12)
+    np.testing.assert_allclose(hills.position, mean[::-1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(hills.cov, cov[::-1], rtol=0, atol=1e-12)
+    assert hills.member.tolist() == [1, 0]
 
 
 def test_near_hypotheses_are_one_candidate_at_their_mean() -> None:
     weight, mean = np.array([0.4, 0.6]), np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
     cov = np.array([0.04 * np.eye(3), 0.09 * np.eye(3)])
-    modes = find_modes(np.log(weight), mean, cov, ANYWHERE)
-    np.testing.assert_allclose(modes.probability, [1.0], rtol=1e-12)
-    np.testing.assert_allclose(modes.position, [[0.3, 0.0, 0.0]], rtol=0, atol=1e-12)
+    hills = hills_of(weight, mean, cov, ANYWHERE)
+    np.testing.assert_allclose(hills.probability, [1.0], rtol=1e-12)
+    np.testing.assert_allclose(hills.position, [[0.3, 0.0, 0.0]], rtol=0, atol=1e-12)
     # 0.4 (0.04 + 0.3^2) + 0.6 (0.09 + 0.2^2) along x
-    np.testing.assert_allclose(modes.cov[0], np.diag([0.13, 0.07, 0.07]), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(hills.cov[0], np.diag([0.13, 0.07, 0.07]), rtol=0, atol=1e-12)
 
 
 def test_the_mode_of_unequal_gaussians_is_where_a_grid_finds_it() -> None:
@@ -136,7 +159,7 @@ def test_gathering_equals_climbing_all_the_way_from_each(seed: int) -> None:
     weight, mean, cov = random_mixture(seed, 40)
     precision = np.asarray(np.linalg.inv(cov), np.float64)
     log_peak = np.log(weight) + 0.5 * np.linalg.slogdet(precision)[1]
-    _, member = mode_kernels.gather(log_peak, mean, precision, 9.0)
+    _, member = modes.gather(log_peak, mean, precision, 9.0)
     tops: list[tuple[Array, Array]] = []
     expected = np.full(40, -1)
     for h in np.argsort(-log_peak):
@@ -158,15 +181,15 @@ def test_candidates_are_in_the_free_space_and_in_order(seed: int) -> None:
     rng = np.random.default_rng(seed)
     free_space = FreeSpace(origin=np.full(3, -3.0), voxel_size=0.25, free=rng.random((24, 24, 24)) < 0.1)
     weight, mean, cov = random_mixture(seed, 30)
-    modes = find_modes(np.log(weight), mean, cov, free_space)
-    assert free_space.contains(modes.position).all()
-    assert modes.probability.sum() == pytest.approx(1.0, abs=1e-12)
-    assert (np.diff(modes.probability) <= 0.0).all()
-    np.testing.assert_allclose(np.bincount(modes.member, weight), modes.probability, rtol=1e-9)
-    np.testing.assert_array_equal(modes.cov, modes.cov.transpose(0, 2, 1))
-    assert (np.linalg.eigvalsh(modes.cov) > 0.0).all()
-    for n, (position, moment) in enumerate(zip(modes.position, modes.cov, strict=True)):
-        mine = modes.member == n
+    hills = hills_of(weight, mean, cov, free_space)
+    assert free_space.contains(hills.position).all()
+    assert hills.probability.sum() == pytest.approx(1.0, abs=1e-12)
+    assert (np.diff(hills.probability) <= 0.0).all()
+    np.testing.assert_allclose(np.bincount(hills.member, weight), hills.probability, rtol=1e-9)
+    np.testing.assert_array_equal(hills.cov, hills.cov.transpose(0, 2, 1))
+    assert (np.linalg.eigvalsh(hills.cov) > 0.0).all()
+    for n, (position, moment) in enumerate(zip(hills.position, hills.cov, strict=True)):
+        mine = hills.member == n
         apart = mean[mine] - position
         about = cov[mine] + apart[:, :, None] * apart[:, None, :]
         np.testing.assert_allclose(moment, np.average(about, axis=0, weights=weight[mine]), rtol=1e-9, atol=1e-12)
@@ -175,8 +198,8 @@ def test_candidates_are_in_the_free_space_and_in_order(seed: int) -> None:
 def test_a_candidate_far_from_any_free_space_stays() -> None:
     free_space = FreeSpace(origin=np.full(3, -3.0), voxel_size=0.25, free=np.zeros((24, 24, 24), np.bool_))
     free_space.free[0, 0, 0] = True
-    modes = find_modes(np.zeros(1), np.array([[1.0, 0.5, 0.2]]), 0.01 * np.eye(3)[None], free_space)
-    np.testing.assert_allclose(modes.position, [[1.0, 0.5, 0.2]], rtol=0, atol=1e-12)
+    hills = hills_of(np.ones(1), np.array([[1.0, 0.5, 0.2]]), 0.01 * np.eye(3)[None], free_space)
+    np.testing.assert_allclose(hills.position, [[1.0, 0.5, 0.2]], rtol=0, atol=1e-12)
 
 
 def test_on_both_sides_of_a_wall_the_likelier_side_is_told() -> None:
@@ -185,7 +208,7 @@ def test_on_both_sides_of_a_wall_the_likelier_side_is_told() -> None:
     free[19:21] = False
     free_space = FreeSpace(origin=np.full(3, -2.0), voxel_size=0.1, free=free)
     weight, mean = np.array([0.45, 0.55]), np.array([[-0.2, 0.0, 0.0], [0.2, 0.0, 0.0]])
-    modes = find_modes(np.log(weight), mean, 0.02 * np.eye(3)[None].repeat(2, axis=0), free_space)
-    assert len(modes.position) == 1
-    assert free_space.contains(modes.position).all()
-    assert 0.1 <= modes.position[0, 0] < 0.2
+    hills = hills_of(weight, mean, 0.02 * np.eye(3)[None].repeat(2, axis=0), free_space)
+    assert len(hills.position) == 1
+    assert free_space.contains(hills.position).all()
+    assert 0.1 <= hills.position[0, 0] < 0.2

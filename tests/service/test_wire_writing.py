@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from rayfix_service.fusion.credible import CredibleRegions
+from rayfix_service.fusion.points import ListedPoints
 from rayfix_service.fusion.report import (
     Angle,
     Candidate,
@@ -39,7 +40,9 @@ def gaussian(xx: float, xy: float, yy: float, zz: float = 1.0) -> np.ndarray:
 def regions_of(candidate: Candidate, share: float = 1.0) -> CredibleRegions:
     """Regions of a fix whose posterior is one Gaussian, but for this share."""
     points = candidate.position + normal_points(1024) @ np.linalg.cholesky(candidate.covariance).T
-    return CredibleRegions(position=candidate.position, covariance=candidate.covariance, points=points, share=share)
+    return CredibleRegions(
+        position=candidate.position, covariance=candidate.covariance, points=ListedPoints(position=points), share=share
+    )
 
 
 @pytest.mark.parametrize(("confidence", "share"), [(0.5, 1.0), (0.68, 0.9), (0.95, 1.0), (0.95, 0.9)])

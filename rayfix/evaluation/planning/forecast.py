@@ -222,7 +222,7 @@ def _outlook(locator: Locator, measurements: tuple[Measurement, ...], threshold:
     regions = locator.locate(Report(measurements=measurements)).regions if measurements else None
     if regions is None:
         return float("inf"), 0.0
-    square = np.square(regions.points - regions.position).sum(axis=1)
+    square = np.square(regions.points.places() - regions.position).sum(axis=1)
     return float(square.mean()), regions.share * float(np.mean(square < threshold**2))
 
 

@@ -1,5 +1,6 @@
 """Multiply factors: hypotheses that pick one alternative of each, the best of them kept and the like merged."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,7 +43,6 @@ class Hypotheses:
 def multiply(
     factors: Sequence[Factor],
     *,
-    num_clocks: int,
     max_path_length: float,
     prior: Prior,
     width: int,
@@ -63,25 +63,18 @@ def multiply(
     max_divergence : float
         What such a merge may cost, nats.
     """
-    log_range = math.log(max_path_length)
-    # Few alternatives first: they cut the beam before it meets the many. Which of two alike comes first must not
-    # depend on the report's order.
-    order = sorted(range(len(factors)), key=lambda i: (len(factors[i]), factors[i].columns[-1].sum()))
-    log_weight, mean, cov, outlier = multiply_factors(
-        prior.column(num_clocks, log_range),
-        np.concatenate([factor.columns for factor in factors], axis=1),
-        np.concatenate([factor.outlier for factor in factors]),
-        np.cumsum([0, *(len(factor) for factor in factors)]),
-        np.array(order),
+    columns = np.concatenate([factor.columns for factor in factors], axis=1)
+    outlier = np.concatenate([factor.outlier for factor in factors])
+    offsets = np.array([0, *itertools.accumulate([len(factor) for factor in factors])])
+    log_weight, mean, cov, outlier, log_lost = multiply_factors(
+        columns,
+        outlier,
+        offsets,
+        prior.precision,
+        prior.eta,
+        prior.log_volume,
+        math.log(max_path_length),
         width,
         max_divergence,
-        prior.log_volume,
-        log_range,
     )
-    return Hypotheses(
-        log_weight=log_weight,
-        mean=mean,
-        cov=cov,
-        outlier=outlier,
-        log_lost=sum(float(factor.columns[-1, -1]) for factor in factors),
-    )
+    return Hypotheses(log_weight=log_weight, mean=mean, cov=cov, outlier=outlier, log_lost=log_lost)

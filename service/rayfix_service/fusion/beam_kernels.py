@@ -14,36 +14,35 @@ HOPELESS = 20.0
 
 @numba.njit(cache=True, nogil=True)
 def multiply_factors(
-    prior: Any,
     alternatives: Any,
     outlier: Any,
     offsets: Any,
-    order: Any,
-    width: Any,
-    max_divergence: Any,
+    precision: Any,
+    eta: Any,
     log_volume: Any,
     log_range: Any,
+    width: Any,
+    max_divergence: Any,
 ) -> Any:
     """Extend a beam by one factor after the other, merging hypotheses that mean the same.
 
     Parameters
     ----------
-    prior : ndarray of shape (rows, 1)
-        Of the state.
     alternatives : ndarray of shape (rows, k)
         Of all factors.
     outlier : ndarray of int8, shape (k,)
         What each takes for an outlier.
     offsets : ndarray of int64, shape (n + 1,)
         Alternatives of factor f are those from ``offsets[f]`` to ``offsets[f + 1]``.
-    order : ndarray of int64, shape (n,)
-        In which the factors are taken.
+        The last of them is that all of it is an outlier.
+    precision, eta, log_volume : float
+        As in :class:`~rayfix_service.fusion.prior.Prior`.
+    log_range : float
+        As in :func:`~rayfix_service.fusion.natural.log_integrals`.
     width : int
         Products that are kept after each factor.
     max_divergence : float
         What a merge may cost, nats.
-    log_volume, log_range : float
-        As in :func:`~rayfix_service.fusion.natural.log_integrals`.
 
     Returns
     -------
@@ -52,12 +51,14 @@ def multiply_factors(
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
     outlier : ndarray of int8, shape (h, n)
+    log_lost : float
+        Log evidence of the hypothesis that all factors are outliers, which is none of the above.
     """
-    beam = prior
-    chosen = np.zeros((1, len(order)), np.int8)
+    beam = _prior_column(dimension_of(alternatives), precision, eta, log_volume, log_range)
+    chosen = np.zeros((1, len(offsets) - 1), np.int8)
     pattern = np.zeros(1, np.int64)
     score = np.zeros(1)
-    for factor in order:
+    for factor in _order(alternatives[-1], offsets):
         begin, stop = offsets[factor], offsets[factor + 1]
         own = np.ascontiguousarray(alternatives[:, begin:stop])
         parent, choice, score = extend_beam(beam, own, width, HOPELESS, log_volume, log_range)
@@ -70,7 +71,7 @@ def multiply_factors(
                 product[row, n] = beam[row, parent[n]] + own[row, choice[n]]
         left = merge_hypotheses(product, score, next_pattern, max_divergence)
         left = left[np.argsort(-score[left], kind="mergesort")]
-        next_chosen = np.empty((len(left), len(order)), np.int8)
+        next_chosen = np.empty((len(left), chosen.shape[1]), np.int8)
         for n in range(len(left)):
             next_chosen[n] = chosen[parent[left[n]]]
             next_chosen[n, factor] = outlier[begin + choice[left[n]]]
@@ -79,7 +80,34 @@ def multiply_factors(
             for n in range(len(left)):
                 beam[row, n] = product[row, left[n]]
         score, pattern, chosen = score[left], next_pattern[left], next_chosen
-    return _placed(beam, score, chosen)
+    log_lost = 0.0
+    for factor in range(len(offsets) - 1):
+        log_lost += alternatives[-1, offsets[factor + 1] - 1]
+    log_weight, mean, cov, chosen = _placed(beam, score, chosen)
+    return log_weight, mean, cov, chosen, log_lost
+
+
+@numba.njit(cache=True, nogil=True)
+def _order(log_scale: Any, offsets: Any) -> Any:
+    """Order in which factors are taken, shape (n,): few alternatives first, which cut the beam before it meets many.
+
+    Which of two alike comes first must not depend on the report's order.
+    """
+    total = np.empty(len(offsets) - 1)
+    for factor in range(len(total)):
+        total[factor] = log_scale[offsets[factor] : offsets[factor + 1]].sum()
+    by_total = np.argsort(total, kind="mergesort")
+    return by_total[np.argsort(np.diff(offsets)[by_total], kind="mergesort")]
+
+
+@numba.njit(cache=True, nogil=True)
+def _prior_column(dimension: Any, precision: Any, eta: Any, log_volume: Any, log_range: Any) -> Any:
+    """Prior of position and clocks, shape (rows, 1); a clock lies evenly in a range of that logarithm."""
+    column = np.zeros((triangle(dimension) + dimension + 1, 1))
+    column[triangle(3) - 1] = precision
+    column[triangle(dimension) + 2] = eta
+    column[-1] = -(dimension - 3) * log_range - log_volume
+    return column
 
 
 @numba.njit(cache=True, nogil=True)

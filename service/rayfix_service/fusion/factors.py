@@ -22,6 +22,8 @@ from rayfix_service.fusion.sight import sight
 _ANY_LENGTH = Term(0.0, 0.0, math.inf)
 """Likelihood of a path length that was not measured."""
 
+_NO_READINGS = np.zeros(0, READING)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Factor:
@@ -61,38 +63,37 @@ def make_factor(
     prior : Prior
         Not part of the factor, but of the judgement which alternatives are worth keeping.
     """
-    # Noise counts, so that a measurement with very much of it does not look like an outlier.
-    log_any_time = -sum(math.log(max_path_length + math.sqrt(2.0 * math.pi * v)) for v in _variances(observation))
-    log_good, log_bad = math.log1p(-settings.outlier_probability), math.log(settings.outlier_probability)
-    log_outlier = log_bad + log_any_time - _log_angle_range(observation)
     said = observation.los_probability
     seen = None if said is None else sight(said, settings.sight_error)
-    directions = (_widened(observation.direction, spread.scale) for spread in observation.angle_spreads)
-    heard = [station.towards(direction, seen) for direction in directions]
-    bounds = [0, *itertools.accumulate(len(gaussians) for gaussians in heard)]
+    heard, bounds = [], [0]
+    for spread in observation.angle_spreads:
+        heard.append(station.towards(_widened(observation.direction, spread.scale), seen))
+        bounds.append(bounds[-1] + len(heard[-1]))
     if bounds[-1] == 0:
         return None
-    timed = bool(observation.lengths or observation.readings)
-    may_be_late = timed and observation.angle_index is not None
+    # Noise counts, so that a measurement with very much of it does not look like an outlier.
+    log_any_time = 0.0
+    for variance in _variances(observation):
+        log_any_time -= math.log(max_path_length + math.sqrt(2.0 * math.pi * variance))
+    log_good, log_bad = math.log1p(-settings.outlier_probability), math.log(settings.outlier_probability)
+    may_be_late = observation.angle_index is not None and bool(observation.lengths or observation.readings)
     kinds, readings = _good_kinds(observation, log_good if may_be_late else 0.0, max_path_length)
     if may_be_late:
         kinds.append(_Kind(TIME_OUTLIER, log_bad + log_any_time, *_ANY_LENGTH[1:]))
+    parts = [
+        (kind.outlier, bounds[n], bounds[n + 1], log_good + spread.log_weight + kind.log_weight, *kind[2:])
+        for kind in kinds
+        for n, spread in enumerate(observation.angle_spreads)
+    ]
     columns, outlier = make_alternatives(
         *join(heard),
-        np.array(
-            [
-                (kind.outlier, begin, stop, log_good + spread.log_weight + kind.log_weight, *kind[2:])
-                for kind in kinds
-                for spread, (begin, stop) in zip(observation.angle_spreads, itertools.pairwise(bounds), strict=True)
-            ],
-            PART,
-        ),
-        np.array(readings, READING),
+        np.array(parts, PART),
+        np.array(readings, READING) if readings else _NO_READINGS,
         num_clocks,
         prior.precision,
         prior.eta,
         prior.log_volume,
-        log_outlier,
+        log_bad + log_any_time - _log_angle_range(observation),
         math.log(settings.component_floor),
         settings.max_divergence,
     )
@@ -151,7 +152,7 @@ def _variances(observation: Observation) -> list[float]:
     """Variance of each time of an observation, m2, whichever Gaussian it is of."""
     lengths = [total_variance(terms) + observation.length_bias_variance for terms in observation.lengths]
     readings = [
-        r.variance * sum(math.exp(spread.log_weight) * spread.scale**2 for spread in r.spreads)
+        r.variance * sum([math.exp(spread.log_weight) * spread.scale**2 for spread in r.spreads])
         for r in observation.readings
     ]
     return lengths + readings

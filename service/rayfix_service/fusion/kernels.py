@@ -37,20 +37,28 @@ def cholesky(matrix: Any, lower: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
+def solve(lower: Any, vector: Any, solution: Any) -> None:
+    """Solve ``matrix solution = vector`` for a matrix given by its Cholesky factor, into ``solution``."""
+    size = len(lower)
+    for i in range(size):
+        value = vector[i]
+        for k in range(i):
+            value -= lower[i, k] * solution[k]
+        solution[i] = value / lower[i, i]
+    for i in range(size - 1, -1, -1):
+        value = solution[i]
+        for k in range(i + 1, size):
+            value -= lower[k, i] * solution[k]
+        solution[i] = value / lower[i, i]
+
+
+@numba.njit(cache=True, nogil=True)
 def invert(lower: Any, inverse: Any) -> None:
     """Inverse of a matrix from its Cholesky factor, into ``inverse``."""
     size = len(lower)
-    column = np.empty(size)
+    unit, column = np.zeros(size), np.empty(size)
     for c in range(size):
-        for i in range(size):
-            value = 1.0 if i == c else 0.0
-            for k in range(i):
-                value -= lower[i, k] * column[k]
-            column[i] = value / lower[i, i]
-        for i in range(size - 1, -1, -1):
-            value = column[i]
-            for k in range(i + 1, size):
-                value -= lower[k, i] * column[k]
-            column[i] = value / lower[i, i]
-        for i in range(size):
-            inverse[i, c] = column[i]
+        unit[c] = 1.0
+        solve(lower, unit, column)
+        unit[c] = 0.0
+        inverse[:, c] = column

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from rayfix_service.fusion.report import GAUSSIAN, ErrorModel
+from rayfix_service.fusion.report import ErrorModel
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
@@ -40,22 +40,22 @@ class Term(NamedTuple):
     variance: float
 
 
+ONE_GAUSSIAN = (Spread(0.0, 1.0),)
+
+
 def spreads(model: ErrorModel) -> tuple[Spread, ...]:
     """Gaussians that an error of this model may be of."""
     if model.tail_share <= 0.0 or model.tail_scale == 1.0:
-        return (Spread(0.0, 1.0),)
+        return ONE_GAUSSIAN
     return (
         Spread(math.log1p(-model.tail_share), 1.0),
         Spread(math.log(model.tail_share), model.tail_scale),
     )
 
 
-ONE_GAUSSIAN = spreads(GAUSSIAN)
-
-
 def gaussian_terms(value: float, stdev: float, model: ErrorModel) -> tuple[Term, ...]:
     """Likelihood of a path length [m] with additive error."""
-    return tuple(Term(log_weight, value, (scale * stdev) ** 2) for log_weight, scale in spreads(model))
+    return tuple([Term(log_weight, value, (scale * stdev) ** 2) for log_weight, scale in spreads(model)])
 
 
 def log_normal_terms(value: float, log_stdev: float) -> tuple[Term, ...]:

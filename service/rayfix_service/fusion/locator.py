@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rayfix_service.fusion.axes import semi_axes
 from rayfix_service.fusion.beam import Hypotheses, multiply
 from rayfix_service.fusion.credible import CredibleRegions
 from rayfix_service.fusion.factors import Factor, make_factor
 from rayfix_service.fusion.fixes import Product, make_fix
 from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.observations import Observation, SortedReport, sort_report
+from rayfix_service.fusion.points import DrawnPoints
 from rayfix_service.fusion.posterior import Posterior, make_posterior
 from rayfix_service.fusion.prior import Prior, even_prior, height_prior
 from rayfix_service.fusion.report import Angle, Fix, Range, Report
@@ -77,10 +77,10 @@ class Locator:
             for stdev in (0.5 * window, window):  # looked up in one cell and in several
                 angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=stdev, zenith_stdev=stdev)
                 self.locate(Report(measurements=(angle, length)))
-        regions = CredibleRegions(position=np.zeros(3), covariance=np.eye(3), points=np.zeros((1, 3)), share=1.0)
-        regions.accuracies(0.5)
+        points = DrawnPoints(mean=np.zeros((1, 3)), root=np.eye(3)[None], owner=np.zeros(8, np.int16))
+        regions = CredibleRegions(position=np.zeros(3), covariance=np.eye(3), points=points, share=1.0)
         regions.upright_ellipsoid(0.5)
-        semi_axes(np.eye(3))
+        _ = regions.accuracies(0.5).ellipsoid.semi_axes
 
     def _product(self, report: Report) -> Product:
         """Multiply what the measurements say."""
@@ -93,7 +93,6 @@ class Locator:
         if factors:
             hypotheses = multiply(
                 factors,
-                num_clocks=sorted_report.num_clocks,
                 max_path_length=self.table.site.max_path_length,
                 prior=prior,
                 width=self.settings.beam_width,

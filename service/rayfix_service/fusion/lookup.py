@@ -16,6 +16,7 @@ radian when one was, and 1 when none was.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,8 +72,7 @@ NO_DIRECTION = Direction(azimuth=None, zenith=None, cov=np.diag([np.inf, np.inf]
 """What a station without an angle has measured."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Lookup:
+class Lookup(NamedTuple):
     """Cells that answer a direction.
 
     Attributes
@@ -147,13 +147,8 @@ def _single_cell(level: Level, cell: int, offset: tuple[float, float], noise: tu
     scale = window / det
     rest = [(d_vv * hh + hv * hv) * scale, window * hv * scale, (d_hh * vv + hv * hv) * scale]
     log_factor = _LOG_2PI + 2.0 * math.log(window) - 0.5 * math.log(det) + 0.5 * (a_h * g_h + a_v * g_v)
-    return Lookup(
-        level=level,
-        cells=np.array([cell]),
-        rest_mean=np.array([[window * g_h, window * g_v]]),
-        rest_cov=np.array([rest]),
-        log_factor=np.array([log_factor]),
-    )
+    mean = [window * g_h, window * g_v]
+    return Lookup(level, np.array([cell]), np.array([mean]), np.array([rest]), np.array([log_factor]))
 
 
 def _cell_sum(level: Level, measured: Direction) -> Lookup:

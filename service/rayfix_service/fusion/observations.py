@@ -26,8 +26,7 @@ MOST_COMBINATIONS = 256
 """Combinations of Gaussians that the measurements of one path may be of: eight of heavy tails, or two powers."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Observation:
+class Observation(NamedTuple):
     """All that a report says of one path to one station.
 
     Attributes
@@ -61,8 +60,7 @@ class Observation:
     los_probability: float | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class SortedReport:
+class SortedReport(NamedTuple):
     """Observations, the number of unknown clocks, and what could not be used, with the reason, by place."""
 
     observations: tuple[Observation, ...]
@@ -150,20 +148,24 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
     clocks = [arrivals] if arrivals else []
     if differences:
         clocks += clocks_of_differences(differences)
-    unbiased = [[_unbiased(arrival, stations[arrival.station_id]) for arrival in clock] for clock in clocks]
-    read = read_clocks(unbiased, site.max_path_length)
-    for arrival, reading in read.readings:
-        drafts[arrival.station_id].readings.append((arrival, reading))
+    num_clocks = 0
+    if clocks:
+        unbiased = [[_unbiased(arrival, stations[arrival.station_id]) for arrival in clock] for clock in clocks]
+        read = read_clocks(unbiased, site.max_path_length)
+        for arrival, reading in read.readings:
+            drafts[arrival.station_id].readings.append((arrival, reading))
+        unused |= read.unused
+        num_clocks = read.num_clocks
     observations = [observation for draft in drafts.values() for observation in _observations(draft)]
     if los_probability(report.measurements) is not None:
         observations = [_with_sight(observation, report) for observation in observations]
-    return SortedReport(observations=tuple(observations), num_clocks=read.num_clocks, unused={**unused, **read.unused})
+    return SortedReport(tuple(observations), num_clocks, unused)
 
 
 def _with_sight(observation: Observation, report: Report) -> Observation:
     places = (observation.angle_index, *observation.timing_indices)
     said = los_probability(report.measurements[place] for place in places if place is not None)
-    return replace(observation, los_probability=said)
+    return observation._replace(los_probability=said)
 
 
 def _unbiased(arrival: Arrival, station: Station) -> Arrival:
@@ -207,19 +209,18 @@ def _observations(draft: _Draft) -> list[Observation]:
         readings = draft.readings if k == 0 else []
         if angle is None and not lengths and not readings:
             continue
+        timing_indices = [index for index, _ in lengths]
+        timing_indices += [arrival.index for arrival, _ in readings if arrival.index is not None]
         observation = Observation(
             station_id=draft.station.id,
             direction=angle.direction if angle else NO_DIRECTION,
             angle_spreads=angle.spreads if angle else ONE_GAUSSIAN,
-            lengths=tuple(terms for _, terms in lengths),
+            lengths=tuple([terms for _, terms in lengths]),
             length_bias_variance=draft.station.bias.range_stdev**2,
-            readings=tuple(reading for _, reading in readings),
+            readings=tuple([reading for _, reading in readings]),
             angle_index=angle.place if angle else None,
-            timing_indices=(
-                *(i for i, _ in lengths),
-                *(arrival.index for arrival, _ in readings if arrival.index is not None),
-            ),
-            differences=tuple(i for arrival, _ in readings for i in arrival.differences),
+            timing_indices=tuple(timing_indices),
+            differences=tuple([index for arrival, _ in readings for index in arrival.differences]),
         )
         _refuse_too_many(observation)
         observations.append(observation)

@@ -1,7 +1,7 @@
 """How probable it is that a measurement has nothing to do with the position."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -11,9 +11,36 @@ from rayfix_service.fusion.factor_kernels import ALL_OUTLIER, TIME_OUTLIER
 from rayfix_service.fusion.observations import Observation
 
 
-def outlier_probabilities(
-    observations: Sequence[Observation], outlier: NDArray[np.int8], weight: NDArray[np.float64], lost: float
-) -> tuple[dict[int, float], float]:
+class Culprits(NamedTuple):
+    """What in a hypothesis makes each measurement an outlier.
+
+    Attributes
+    ----------
+    places : list of int
+        Of the used measurements in the report.
+    rows : ndarray of int64, shape (r, 3)
+        Number of a measurement among ``places``, an observation, and the least that the observation's outlier must be.
+    """
+
+    places: list[int]
+    rows: NDArray[np.int64]
+
+
+def culprits(observations: Sequence[Observation]) -> Culprits:
+    """Which outliers of the observations make which measurements of the report outliers."""
+    # A time difference is as bad as the worse of its two times.
+    number: dict[int, int] = {}
+    rows = []
+    for n, observation in enumerate(observations):
+        if observation.angle_index is not None:
+            rows.append((number.setdefault(observation.angle_index, len(number)), n, ALL_OUTLIER))
+        times = (*observation.timing_indices, *observation.differences)
+        rows += [(number.setdefault(index, len(number)), n, TIME_OUTLIER) for index in times]
+    return Culprits(list(number), np.array(rows))
+
+
+@numba.njit(cache=True, nogil=True)
+def outlier_probabilities(outlier: Any, weight: Any, lost: Any, rows: Any, count: Any) -> Any:
     """Posterior probabilities of outliers.
 
     Parameters
@@ -24,42 +51,17 @@ def outlier_probabilities(
         Posterior probabilities of the hypotheses.
     lost : float
         Posterior probability that everything is an outlier.
-
-    Returns
-    -------
-    dict of int to float
-        Of each used measurement to be an outlier, by its place in the report.
-    float
-        Of at least half of the observations to be outliers altogether.
-    """
-    # A time difference is as bad as the worse of its two times.
-    places: dict[int, list[tuple[int, int]]] = {}
-    for n, observation in enumerate(observations):
-        if observation.angle_index is not None:
-            places[observation.angle_index] = [(n, ALL_OUTLIER)]
-        for index in (*observation.timing_indices, *observation.differences):
-            places.setdefault(index, []).append((n, TIME_OUTLIER))
-    rows = [(row, *place) for row, own in enumerate(places.values()) for place in own]
-    total, half_bad = _sum_up(outlier, weight, lost, np.array(rows), len(places))
-    return dict(zip(places, total.tolist(), strict=True)), half_bad
-
-
-@numba.njit(cache=True, nogil=True)
-def _sum_up(outlier: Any, weight: Any, lost: Any, rows: Any, count: Any) -> Any:
-    """Sum the weights of the hypotheses that hold a measurement for an outlier.
-
-    Parameters
-    ----------
     rows : ndarray of int64, shape (r, 3)
-        Measurement, observation, and the least that the observation's outlier must be.
+        As in :class:`Culprits`.
     count : int
-        Number of measurements.
+        Number of measurements there.
 
     Returns
     -------
     total : ndarray of shape (count,)
+        Of each measurement to be an outlier.
     half_bad : float
-        The same for at least half of the observations.
+        Of at least half of the observations to be outliers altogether.
     """
     total, half_bad = np.full(count, lost), lost
     bad = np.empty(count, np.bool_)

@@ -9,9 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rayfix_service.fusion.natural import triangle
 from rayfix_service.fusion.report import Height
 from rayfix_tables.errors import ReportError
 from rayfix_tables.freespace import FreeSpace
@@ -38,22 +36,6 @@ class Prior:
     log_volume: float
     precision: float = 0.0
     eta: float = 0.0
-
-    def column(self, num_clocks: int, log_range: float) -> NDArray[np.float64]:
-        """Prior of position and clocks as :mod:`rayfix_service.fusion.natural` has it, shape (rows, 1).
-
-        Parameters
-        ----------
-        num_clocks : int
-        log_range : float
-            Natural logarithm of the range [m] in which a clock's offset lies evenly.
-        """
-        dimension = 3 + num_clocks
-        column = np.zeros((triangle(dimension) + dimension + 1, 1))
-        column[triangle(3) - 1] = self.precision
-        column[triangle(dimension) + 2] = self.eta
-        column[-1] = -num_clocks * log_range - self.log_volume
-        return column
 
 
 def even_prior(free_space: FreeSpace) -> Prior:

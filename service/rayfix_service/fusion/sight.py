@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 from rayfix_service.fusion.lookup import Lookup
 from rayfix_service.fusion.report import Angle, Measurement, Range, TimeOfArrival
 
+_JUDGED = (Angle, Range, TimeOfArrival)
+"""Measurements of which a receiver may say whether their path is direct."""
+
 
 class Sight(NamedTuple):
     """Logarithms of what the weights of direct and of reflected paths are multiplied by."""
@@ -37,11 +40,7 @@ def los_probability(measurements: Iterable[Measurement]) -> float | None:
 
     They are of one signal, so that its shape must not count once for each of them.
     """
-    said = [
-        m.los_probability
-        for m in measurements
-        if isinstance(m, Angle | Range | TimeOfArrival) and m.los_probability is not None
-    ]
+    said = [m.los_probability for m in measurements if isinstance(m, _JUDGED) and m.los_probability is not None]
     return sum(said) / len(said) if said else None
 
 

@@ -15,8 +15,7 @@ def is_free(free: Any, x: Any, y: Any, z: Any) -> Any:
     The compiled twin of :meth:`rayfix_tables.freespace.FreeSpace.contains`.
     """
     nx, ny, nz = free.shape
-    i, j, k = np.floor(x), np.floor(y), np.floor(z)
-    return 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and free[int(i), int(j), int(k)]
+    return 0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz and free[int(x), int(y), int(z)]
 
 
 @numba.njit(cache=True, nogil=True)

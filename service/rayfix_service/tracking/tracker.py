@@ -13,6 +13,7 @@ import numpy as np
 
 from rayfix_service.fusion.credible import CredibleRegions
 from rayfix_service.fusion.locator import Fused
+from rayfix_service.fusion.points import ListedPoints
 from rayfix_service.moments import utc_moment
 from rayfix_service.tracking.estimate import Estimate, estimate
 from rayfix_service.tracking.likelihood import likelihood_of
@@ -221,6 +222,9 @@ def _told(state: TrackState, timestamp: str, num_reports: int, particles: Partic
         num_reports=num_reports,
         estimate=found,
         regions=CredibleRegions(
-            position=found.position, covariance=found.covariance, points=particles.position, share=1.0
+            position=found.position,
+            covariance=found.covariance,
+            points=ListedPoints(position=particles.position),
+            share=1.0,
         ),
     )

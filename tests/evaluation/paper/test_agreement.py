@@ -65,7 +65,6 @@ def closed_form(table: Table, *measurements: Measurement) -> tuple[Array, Array]
         factors.append(factor)
     found = beam.multiply(
         factors,
-        num_clocks=sorted_report.num_clocks,
         width=NO_OUTLIERS.beam_width,
         max_divergence=NO_OUTLIERS.max_divergence,
         **limits,
