@@ -4,6 +4,7 @@ A fix is half compiled loops and half Python, which one thread of a process runs
 nothing; processes do. Each maps the table's file, which they therefore share in memory.
 """
 
+import pickle
 from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache
@@ -57,12 +58,12 @@ def locate_batch(
     named = table.path.resolve(), table.table_id, locator.settings
     parallel = Parallel(n_jobs=jobs, backend="loky", batch_size=1, pre_dispatch="all")
     try:
-        answers = parallel(delayed(_locate_elsewhere)(*named, block) for block in blocks)
+        packed = parallel(delayed(_locate_elsewhere)(*named, pickle.dumps(block)) for block in blocks)
     except BrokenProcessPool as error:
         raise RayfixError(
             "a process that located reports ended early, as it does when memory runs out; give fewer reports or jobs"
         ) from error
-    return [answer for block in answers for answer in block]
+    return [answer for block in packed for answer in pickle.loads(block)]
 
 
 def _locate_block(locator: Locator, reports: Sequence[Report | Mapping[str, Any]]) -> list[Fix | ReportError]:
@@ -75,10 +76,9 @@ def _locate_block(locator: Locator, reports: Sequence[Report | Mapping[str, Any]
     return answers
 
 
-def _locate_elsewhere(
-    path: Path, table_id: str, settings: FusionSettings, reports: Sequence[Report | Mapping[str, Any]]
-) -> list[Fix | ReportError]:
-    return _locate_block(_locator(path, table_id, settings), reports)
+def _locate_elsewhere(path: Path, table_id: str, settings: FusionSettings, packed: bytes) -> bytes:
+    """Locate pickled reports; joblib's own pickler asks Python about each object, which takes longer than its fix."""
+    return pickle.dumps(_locate_block(_locator(path, table_id, settings), pickle.loads(packed)))
 
 
 @lru_cache(maxsize=4)

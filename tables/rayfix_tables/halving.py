@@ -113,39 +113,47 @@ def _tree(mean: Any, group: Any, scale: Any) -> Any:
             left[node], right[node] = -1, begin
             node += 1
             continue
-        least = group[order[begin]]
+        least = greatest = group[order[begin]]
         if mixed[node]:  # what a box of one group is cut into is, too
-            greatest = least
             for n in range(begin, end):
                 least, greatest = min(least, group[order[n]]), max(greatest, group[order[n]])
-            mixed[node] = greatest > least
-        for a in range(dimension):
-            low[a], high[a] = np.inf, -np.inf
-        for n in range(begin, end):
-            component = order[n]
+        mixed[node] = greatest > least
+        if mixed[node]:
+            i = _partition(order, begin, end, group, least + (greatest - least) // 2 + 1)
+        else:
             for a in range(dimension):
-                low[a], high[a] = min(low[a], mean[component, a]), max(high[a], mean[component, a])
-        longest, axis = -1.0, 0
-        for a in range(dimension):
-            if (high[a] - low[a]) / scale[a] > longest:
-                longest, axis = (high[a] - low[a]) / scale[a], a
-        middle = 0.5 * (low[axis] + high[axis])
-        i, j = begin, end - 1
-        while i <= j:
-            component = order[i]
-            if (group[component] == least) if mixed[node] else (mean[component, axis] < middle):
-                i += 1
-            else:
-                order[i], order[j] = order[j], order[i]
-                j -= 1
+                low[a], high[a] = np.inf, -np.inf
+            for n in range(begin, end):
+                component = order[n]
+                for a in range(dimension):
+                    low[a], high[a] = min(low[a], mean[component, a]), max(high[a], mean[component, a])
+            longest, axis = -1.0, 0
+            for a in range(dimension):
+                if (high[a] - low[a]) / scale[a] > longest:
+                    longest, axis = (high[a] - low[a]) / scale[a], a
+            i = _partition(order, begin, end, mean[:, axis], 0.5 * (low[axis] + high[axis]))
         if i in (begin, end):  # all in one place
             i = (begin + end) // 2
         left[node], right[node] = size, size + 1
-        first[size], stop[size] = begin, i
+        first[size], stop[size], mixed[size] = begin, i, mixed[node]
         first[size + 1], stop[size + 1], mixed[size + 1] = i, end, mixed[node]
         size += 2
         node += 1
     return order, left, right, size
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _partition(order: Any, begin: Any, end: Any, value: Any, limit: Any) -> Any:
+    """Bring the components of a part of ``order`` whose value is below a limit to its front; returns where they end."""
+    i, j = begin, end - 1
+    while i <= j:
+        component = order[i]
+        if value[component] < limit:
+            i += 1
+        else:
+            order[i], order[j] = order[j], component
+            j -= 1
+    return i
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
