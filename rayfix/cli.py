@@ -36,7 +36,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
-    parser = _Parser(prog="rayfix", description="Indoor position fixes from angles and times of arrival.")
+    parser = _Parser(
+        prog="rayfix",
+        description="Indoor position fixes from angles and times of arrival.",
+        epilog="'rayfix COMMAND --help' lists a command's options. To begin: rayfix demo",
+    )
     parser.add_argument("--version", action="version", version=f"rayfix {software_version()}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
 

@@ -18,8 +18,6 @@ from rich.progress import (
     TaskID,
     TaskProgressColumn,
     TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 from rich.table import Table as Grid
 from rich.text import Text
@@ -44,9 +42,7 @@ def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
         BarColumn(bar_width=12),
         TaskProgressColumn(),
         _RateColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+        _TimesColumn(),
         _MemoryColumn(),
         console=Console(stderr=True),
     )
@@ -58,10 +54,8 @@ def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
             bar.start()
             bar.update(task, description=stage, completed=done, total=total)
 
-    try:
+    with _stopped(bar):
         yield show
-    finally:
-        bar.stop()
 
 
 @contextmanager
@@ -74,9 +68,7 @@ def evaluation_progress(*, enabled: bool) -> "Iterator[Callable[[str, int, int],
         TextColumn("{task.description:<24}"),
         BarColumn(bar_width=24),
         TaskProgressColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(elapsed_when_finished=False, compact=True),
+        _TimesColumn(),
         console=Console(stderr=True),
     )
     tasks: dict[str, TaskID] = {}
@@ -91,10 +83,18 @@ def evaluation_progress(*, enabled: bool) -> "Iterator[Callable[[str, int, int],
             tasks[name] = bar.add_task(name, total=total)
         bar.update(tasks[name], completed=done, total=total)
 
-    try:
+    with _stopped(bar):
         yield show
+
+
+@contextmanager
+def _stopped(bar: Progress) -> Iterator[None]:
+    """Stop a bar in the end; one that was never shown would leave an empty line."""
+    try:
+        yield
     finally:
-        bar.stop()
+        if bar.live.is_started:
+            bar.stop()
 
 
 def print_evaluation(results: Mapping[str, Any], page: Path) -> None:
@@ -123,6 +123,21 @@ class _RateColumn(ProgressColumn):
         return Text(f"{task.speed:,.0f} cells/s" if task.speed else "", justify="right")
 
 
+class _TimesColumn(ProgressColumn):
+    """Time that is gone, and what is left of it while there is work."""
+
+    def render(self, task: Task) -> Text:
+        gone = _clock(task.finished_time if task.finished else task.elapsed)
+        return Text(gone if task.finished else f"{gone}, {_clock(task.time_remaining)} left")
+
+
+def _clock(seconds: float | None) -> str:
+    if seconds is None:
+        return "-:--"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"
+
+
 class _MemoryColumn(ProgressColumn):
     """Most memory that the process has held."""
 
@@ -141,8 +156,8 @@ def print_check(check: "Check") -> None:
     curved = f" in {twin.planes.num_surfaces:,} surfaces" if twin.planes.curved else ""
     lines.append(
         f"{check.site_path}: scene of {size} m with {len(twin.scene.faces):,} triangles on {len(twin.planes):,} planes"
-        f"{curved}, {twin.free_space.volume:,.0f} m3 of free space; {check.num_errors} errors, "
-        f"{len(check.findings) - check.num_errors} warnings"
+        f"{curved}, {twin.free_space.volume:,.0f} m3 of free space; {counted(check.num_errors, 'error')}, "
+        f"{counted(len(check.findings) - check.num_errors, 'warning')}"
     )
     console = Console()
     for line in lines:
@@ -170,9 +185,9 @@ def print_build_summary(summary: "BuildSummary") -> None:
         grid.add_row(
             s.station_id,
             s.origin,
-            str(s.num_cells),
-            str(s.num_filled_cells),
-            str(s.num_components),
+            f"{s.num_cells:,}",
+            f"{s.num_filled_cells:,}",
+            f"{s.num_components:,}",
             f"{s.num_bytes / 1e6:.1f}",
             f"{s.lost_ray_share:.3%}",
             *(f"{share:.0%}" for share in s.coverage),
@@ -257,7 +272,9 @@ def print_table_info(table: Table) -> None:
         f"scene of {facts['faces']:,} triangles, {facts['free_space_m3']:,.0f} m3 of free space",
     ):
         console.print(line, highlight=False, soft_wrap=True)
-    grid = Grid("station", "position, m", "window, deg", "cells", "components")
+    grid = Grid("station", "position, m", box=box.SIMPLE_HEAD)
+    for heading in ("window, deg", "cells", "components"):
+        grid.add_column(heading, justify="right")
     for station in facts["stations"]:
         for n, level in enumerate(station["levels"]):
             grid.add_row(
@@ -273,8 +290,9 @@ def print_table_info(table: Table) -> None:
             cells = sum(level["cells"] for level in station["levels"])
             update = station["update"]
             console.print(
-                f"{station['id']}: {_kept(update['changed_cells'], cells, update['largest_change'])} (tolerance "
-                f"{update['tolerance']:.2%}); build without --tolerance to make it exact",
+                f"{station['id']}: {update['changed_cells']:,} of {cells:,} cells differ from those of a whole build, "
+                f"by at most {update['largest_change']:.2%} (tolerance {update['tolerance']:.2%}); build without "
+                "--tolerance to make it exact",
                 highlight=False,
                 soft_wrap=True,
             )
@@ -298,6 +316,11 @@ def print_fix(document: Mapping[str, Any]) -> None:
             print(f"  measurement {outcome['index']} not used: {outcome['reason']}")
         elif outcome["outlier_probability"] > 0.5:
             print(f"  measurement {outcome['index']} is an outlier ({outcome['outlier_probability']:.0%})")
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def place(position: Mapping[str, float]) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 import httpx
 import numpy as np
 
-from rayfix.console import build_progress, place, print_build_summary
+from rayfix.console import build_progress, counted, place, print_build_summary
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths, report_text, simulate_example_report
 from rayfix.example.files import REPORT_FILE, write_example
 from rayfix.plot import plot_fix
@@ -57,7 +57,7 @@ def run_demo(folder: Path, *, jobs: int = -1) -> float:
     (folder / REPORT_FILE).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     for station_id, found in paths.items():
         bounces = int(found.num_reflections[0])
-        print(f"   {station_id} hears it " + ("directly" if bounces == 0 else f"by {bounces} reflection(s)"))
+        print(f"   {station_id} hears it " + ("directly" if bounces == 0 else f"by {counted(bounces, 'reflection')}"))
 
     print("\n3. The service takes the report.")
     with _service(table_path) as url:

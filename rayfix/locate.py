@@ -30,7 +30,7 @@ def locate_file(
     input_format, output_format : str
         Formats of docs/formats.md.
     stations : Mapping, optional
-        Stations by the names that the file has for them.
+        Stations by the names that the file has for them; a native report has the table's own.
     height : Height, optional
         What is known of the target's height, for reports that say nothing of it.
 
@@ -41,6 +41,8 @@ def locate_file(
     ReportError
         When the report cannot be read or used; the message names the file.
     """
+    if stations and input_format == "native":
+        raise ReportError("a native report names the stations of the table; --station is for other systems' messages")
     try:
         body = report_path.read_bytes()
     except OSError as error:

@@ -13,10 +13,9 @@ from rayfix.evaluation.planning.forecast import PlanMap, PlanSettings, finite, f
 from rayfix.evaluation.planning.forecast import Progress as PlanProgress
 from rayfix.evaluation.planning.picture import draw_comparison, draw_plan
 from rayfix.evaluation.simulate import Noise, Timing
+from rayfix.picture import check_picture
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table
-
-_PICTURES = (".png", ".svg", ".pdf")
 
 
 def plan_settings(
@@ -60,10 +59,9 @@ def plan_tables(
     Raises
     ------
     RayfixError
-        If a table cannot be opened, nothing is free at the height, or the picture is of an unknown type.
+        If a table cannot be opened, nothing is free at the height, or the picture cannot be written.
     """
-    if output.suffix not in _PICTURES:
-        raise RayfixError(f"{output}: a map is a picture; end its name in {', '.join(_PICTURES)}")
+    check_picture(output)
     opened = [Table.open(path) for path in tables]
     maps = []
     for table in opened:

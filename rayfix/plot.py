@@ -14,13 +14,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import ArrayLike, NDArray
 
+from rayfix.picture import save_picture
 from rayfix_tables.table import Table
 
 _INK, _RAY, _FIX, _RIVAL, _TRUTH, _STATION = "#2b2f36", "#3b7dd8", "#d1495b", "#e9a5ae", "#1a936f", "#2b2f36"
 _TWO_SIGMA = 2.0
 
 View = tuple[int, int]
-"""Coordinates that run to the right and up."""
+"""Coordinates that run to the right, and up or (x) down."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +66,7 @@ class SceneFigure:
                 labelcolor=_INK,
             )
         self.figure.suptitle(_title(self.table, document, truth), fontsize=11, color=_INK, x=0.01, ha="left")
-        self.figure.savefig(path, dpi=130)
+        save_picture(self.figure, path)
 
 
 def make_figure(table: Table) -> SceneFigure:
@@ -90,6 +91,8 @@ def make_figure(table: Table) -> SceneFigure:
                 axes.annotate(station.id, spot, textcoords="offset points", xytext=(7, 5), color=_STATION, fontsize=9)
         axes.set_xlim(bounds[0, along] - margin, bounds[1, along] + margin)
         axes.set_ylim(bounds[0, vertical] - margin, bounds[1, vertical] + margin)
+        if vertical == 0:
+            axes.invert_yaxis()  # x runs down where y runs to the right: seen from above, and not in a mirror
         axes.set_aspect("equal")
         axes.set_ylabel(f"{names[vertical]} [m]")
         axes.set_title(title, loc="left", fontsize=10, color=_INK)

@@ -180,7 +180,8 @@ def _draw_contours(
 
 
 def _limits(axes: Axes) -> tuple[tuple[float, float], tuple[float, float]]:
-    return axes.get_xlim(), axes.get_ylim()
+    """Limits of both coordinates, ascending: x may run down."""
+    return axes.get_xbound(), axes.get_ybound()
 
 
 def _percentages() -> str:

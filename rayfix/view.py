@@ -19,6 +19,8 @@ from rayfix_service.wire import InvalidReportError, fix_to_document, parse_repor
 from rayfix_tables.errors import RayfixError, ReportError
 from rayfix_tables.table import Table
 
+_PAGES = (".html", ".htm")
+
 
 class ViewError(RayfixError):
     """The page cannot be written."""
@@ -49,6 +51,8 @@ def write_view(table_path: Path, output: Path, report_path: Path | None = None) 
     ViewError
         When the viewer is not built, or the page cannot be written.
     """
+    if output.suffix.lower() not in _PAGES:
+        raise ViewError(f"{output} is no name of a page; end it in {_PAGES[0]}")
     table = Table.open(table_path)
     locator = Locator(table)
     if report_path is not None:

@@ -73,7 +73,7 @@ def size_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
     elif extent.max() < SMALL_SCENE:
         yield warning("unit", f"the scene is only {size} m large", "set scene_unit to the unit of its coordinates")
     if extent[2] > 2.0 * extent[:2].min() and not scene.says_up:
-        other = "z" if site.site.scene_up == "y" else "y"
+        other = _other_axis(site)
         yield warning(
             "upward axis",
             f"the scene is {size} m large and seems to lie on its side",
@@ -167,10 +167,7 @@ def material_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
 
 def station_findings(site: SiteFile, scene: Scene, parts: Sequence[Part], enclosures: Enclosures) -> Iterator[Finding]:
     """Find stations where none can be."""
-    outside = "correct position_m or scene_unit"
-    unit = _unit_of_stations(site, scene)
-    if unit is not None:
-        outside = f'set scene_unit = "{unit}": then all stations lie inside'
+    outside = _what_would_hold_stations(site, scene) or "correct position_m or scene_unit"
     for s, station in enumerate(site.stations):
         position = np.array(station.position_m)
         place = _placed(station)
@@ -200,16 +197,33 @@ def _misplacement(
     return None
 
 
-def _unit_of_stations(site: SiteFile, scene: Scene) -> str | None:
-    """Return the unit in which all stations would lie inside; None when they do already, or do in no unit."""
+def _what_would_hold_stations(site: SiteFile, scene: Scene) -> str | None:
+    """Return the unit or the upward axis with which all stations would lie inside; None when they do, or none does."""
     positions = np.array([station.position_m for station in site.stations])
-    current = METRES_PER_UNIT[site.site.scene_unit]
-    fitting = [
-        unit
-        for unit, metres in METRES_PER_UNIT.items()
-        if np.all((positions >= scene.bounds[0] * metres / current) & (positions <= scene.bounds[1] * metres / current))
-    ]
-    return fitting[0] if fitting and site.site.scene_unit not in fitting else None
+
+    def held(bounds: NDArray[np.float64]) -> bool:
+        return bool(np.all((positions >= bounds[0]) & (positions <= bounds[1])))
+
+    remedy = None
+    if not held(scene.bounds):
+        current = METRES_PER_UNIT[site.site.scene_unit]
+        units = [unit for unit, metres in METRES_PER_UNIT.items() if held(scene.bounds * metres / current)]
+        if units:
+            remedy = f'scene_unit = "{units[0]}"'
+        elif not scene.says_up and held(_turned(scene.bounds, site.site.scene_up)):
+            remedy = f'scene_up = "{_other_axis(site)}"'
+    return remedy and f"set {remedy}: then all stations lie inside"
+
+
+def _other_axis(site: SiteFile) -> str:
+    return "z" if site.site.scene_up == "y" else "y"
+
+
+def _turned(bounds: NDArray[np.float64], up: str) -> NDArray[np.float64]:
+    """Bounds of a scene that was read with this axis up, as if it were the other one."""
+    x, y, z = bounds.T
+    turned = (x, z, -y) if up == "y" else (x, -z, y)
+    return np.sort(np.stack(turned, axis=1), axis=0)
 
 
 def _placed(station: StationSection) -> str:

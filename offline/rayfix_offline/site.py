@@ -144,8 +144,10 @@ def read_site(path: str | Path) -> SiteFile:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise SiteError(f"there is no site file at {path}; 'rayfix example DIR' writes one to start from") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise SiteError(f"{path} cannot be read ({error}); give a TOML site file") from error
+    except OSError as error:
+        raise SiteError(f"{path} cannot be read ({error.strerror}); give a TOML site file") from error
+    except UnicodeDecodeError as error:
+        raise SiteError(f"{path} is no text in UTF-8; give a TOML site file") from error
     except tomllib.TOMLDecodeError as error:
         raise SiteError(f"{path} is not valid TOML: {error}") from error
     return parse_site(document, source=str(path))
@@ -178,11 +180,21 @@ def _problem(error: Any) -> str:
         known = _known_keys(error["loc"][:-1])
         return f"unknown key {key}; {f'[{section}]' if section else 'the file'} knows {', '.join(known)}"
     if error["type"] == "missing":
-        return f"{key} is missing"
+        return f"{key} is missing: {_what_to_add(error['loc'])}"
+    if error["type"] == "string_pattern_mismatch":
+        return f"{key} = {error['input']!r}: give 1 to 64 letters, digits or . _ : -, a letter or digit first"
     message = str(error["msg"]).removeprefix("Value error, ")
     if error["type"] == "value_error":
         return f"{key}: {message}" if key else message
     return f"{key} = {error['input']!r}: {message[0].lower()}{message[1:]}"
+
+
+def _what_to_add(location: tuple[str | int, ...]) -> str:
+    if isinstance(location[-1], int):
+        return "give three numbers"
+    if len(location) > 1:
+        return "add it"
+    return f"add a section {'[[stations]]' if location[0] == 'stations' else f'[{location[0]}]'}"
 
 
 def _known_keys(location: tuple[str | int, ...]) -> list[str]:

@@ -1,9 +1,11 @@
 """What the commands' arguments share: how a command is added, values that are checked, options that several have."""
 
 import argparse
+import math
 import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
+from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
     from rayfix_service.adapters.omlox_hub import HubSettings
@@ -11,48 +13,69 @@ if TYPE_CHECKING:
 AddCommand = Callable[[str, Callable[[argparse.Namespace], int], str], argparse.ArgumentParser]
 """Makes a command of a name, what it runs, and what it does in words."""
 
+_Number = TypeVar("_Number", int, float)
+
 _OUTPUTS = ("native", "3gpp", "omlox")
 _HUB_VARIABLE = "RAYFIX_OMLOX_TOKEN"
 
 
 def job_count(text: str) -> int:
     """Read a number of processes."""
-    jobs = int(text)
-    if jobs == 0 or jobs < -1:
-        raise argparse.ArgumentTypeError(f"{jobs} is not a number of jobs; give 1 or more, or -1 for one per core")
-    return jobs
+    return _number(
+        text,
+        int,
+        lambda jobs: jobs == -1 or jobs >= 1,
+        "is not a number of jobs; give 1 or more, or -1 for one per core",
+    )
 
 
 def report_rate(text: str) -> float:
     """Read a number of reports a second."""
-    rate = float(text)
-    if not 0.0 < rate < 1e9:
-        raise argparse.ArgumentTypeError(f"{text} is no rate; give a number of reports a second, e.g. 100")
-    return rate
+    return _number(
+        text, float, lambda rate: 0.0 < rate < 1e9, "is no rate; give a number of reports a second, e.g. 100"
+    )
 
 
 def drop_count(text: str) -> int:
-    """Read a number of drops."""
-    drops = int(text)
-    if drops < 2:
-        raise argparse.ArgumentTypeError(f"{drops} drops have no percentiles; give 2 or more")
-    return drops
+    """Read a number of drops; fewer than two have no percentiles."""
+    return _number(text, int, lambda drops: drops >= 2, "is no number of drops; give 2 or more")
 
 
 def seed_number(text: str) -> int:
     """Read a seed of random numbers."""
-    seed = int(text)
-    if seed < 0:
-        raise argparse.ArgumentTypeError(f"{seed} is no seed; give 0 or more")
-    return seed
+    return _number(text, int, lambda seed: seed >= 0, "is no seed; give a whole number, 0 or more")
 
 
 def mass_share(text: str) -> float:
     """Read a share of a cell's mass."""
-    tolerance = float(text)
-    if not 0.0 <= tolerance < 1.0:
-        raise argparse.ArgumentTypeError(f"{text} is no share; give 0 or more, below 1, e.g. 0.01")
-    return tolerance
+    return _number(text, float, lambda share: 0.0 <= share < 1.0, "is no share; give 0 or more, below 1, e.g. 0.01")
+
+
+def coordinate(text: str) -> float:
+    """Read a coordinate."""
+    return _number(text, float, math.isfinite, "is no coordinate; give a number of metres")
+
+
+def web_origin(text: str) -> str:
+    """Read the origin of a web page, as browsers send it."""
+    parts = urlsplit(text)
+    whole = parts.scheme in ("http", "https") and parts.netloc and text == f"{parts.scheme}://{parts.netloc}"
+    if text != "*" and not whole:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no origin; give scheme, host and port without a path, e.g. https://maps.example.com"
+        )
+    return text
+
+
+def _number(text: str, kind: Callable[[str], _Number], fits: Callable[[_Number], bool], otherwise: str) -> _Number:
+    try:
+        value = kind(text)
+    except ValueError:
+        pass
+    else:
+        if fits(value):
+            return value
+    raise argparse.ArgumentTypeError(f"{text!r} {otherwise}")
 
 
 def add_output_arguments(command: argparse.ArgumentParser) -> None:

@@ -24,7 +24,7 @@ def add_commands(add: AddCommand) -> None:
     plan.add_argument("--spacing-m", type=float, default=0.5, metavar="M", help="side of the squares (default: 0.5)")
     plan.add_argument("--threshold-m", type=float, default=1.0, metavar="M", help="largest useful error (default: 1)")
     plan.add_argument("--draws", type=int, default=4, help="reports from each square (default: 4)")
-    plan.add_argument("--seed", type=int, default=1, help="of places and noise (default: 1)")
+    plan.add_argument("--seed", type=seed_number, default=1, help="of places and noise (default: 1)")
     plan.add_argument("--no-progress", action="store_true", help="show no progress bar")
     plan.add_argument("--json", action="store_true", help="print the map as JSON, one line for each table")
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rayfix.commands.arguments import AddCommand
+from rayfix.commands.arguments import AddCommand, coordinate, seed_number
 from rayfix.extras import needs_extra
 
 _LAYERS = ("rays", "points", "mixture", "posterior", "fix")
@@ -27,12 +27,14 @@ def add_commands(add: AddCommand) -> None:
         metavar="NAMES",
         help=f"what to draw, of {','.join(_LAYERS)} (default: rays,mixture,posterior,fix)",
     )
-    plot.add_argument("--truth", type=float, nargs=3, metavar=("X", "Y", "Z"), help="true position, m")
-    plot.add_argument("--seed", type=int, default=1, help="of rays and points (default: 1)")
+    plot.add_argument("--truth", type=coordinate, nargs=3, metavar=("X", "Y", "Z"), help="true position, m")
+    plot.add_argument("--seed", type=seed_number, default=1, help="of rays and points (default: 1)")
 
 
 def _layers(text: str) -> tuple[str, ...]:
     names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not names:
+        raise argparse.ArgumentTypeError(f"{text!r} names no layer; give some of {','.join(_LAYERS)}")
     if unknown := [name for name in names if name not in _LAYERS]:
         raise argparse.ArgumentTypeError(f"{unknown[0]!r} is no layer; give some of {','.join(_LAYERS)}")
     return names
@@ -49,12 +51,14 @@ def _view(options: argparse.Namespace) -> int:
 
 def _plot(options: argparse.Namespace) -> int:
     with needs_extra("all"):
+        from rayfix.picture import check_picture
         from rayfix.report_plot import plot_report
         from rayfix.view import read_reports
         from rayfix_service.fusion.locator import Locator
         from rayfix_service.wire import fix_to_document, parse_report
         from rayfix_tables.errors import ReportError
         from rayfix_tables.table import Table
+    check_picture(options.output)
     locator = Locator(Table.open(options.table))
     documents = read_reports(options.report)
     if len(documents) != 1:

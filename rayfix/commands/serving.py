@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rayfix.commands.arguments import AddCommand, add_hub_argument, hub_settings, report_rate
+from rayfix.commands.arguments import AddCommand, add_hub_argument, hub_settings, report_rate, web_origin
 from rayfix.extras import needs_extra
 
 
@@ -34,6 +34,7 @@ def add_commands(add: AddCommand) -> None:
     )
     serve.add_argument(
         "--cors-origin",
+        type=web_origin,
         action="append",
         default=[],
         metavar="ORIGIN",

@@ -57,14 +57,23 @@ def write_example(folder: str | Path, *, windows_deg: tuple[float, ...] = (1.25,
     Raises
     ------
     RayfixError
-        When the folder cannot be written.
+        When the folder cannot be written, or has other files of these names: they may hold somebody's work.
     """
     folder = Path(folder)
+    files = {
+        folder / SCENE_FILE: hall_scene().export(file_type="glb"),
+        folder / SITE_FILE: _site_text(windows_deg).encode(),
+        folder / REPORT_FILE: example_report().encode(),
+    }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / SCENE_FILE).write_bytes(hall_scene().export(file_type="glb"))
-        (folder / SITE_FILE).write_text(_site_text(windows_deg), encoding="utf-8")
-        (folder / REPORT_FILE).write_text(example_report(), encoding="utf-8")
+        for path, content in files.items():
+            if path.exists() and path.read_bytes() != content:
+                raise RayfixError(
+                    f"{path} is there and is not the example's; choose another folder, or remove it first"
+                )
+        for path, content in files.items():
+            path.write_bytes(content)
     except OSError as error:
         raise RayfixError(f"cannot write the example into {folder}: {error.strerror}; choose another folder") from error
     return folder / SITE_FILE

@@ -77,6 +77,10 @@ class Table:
     scene: Scene
     parts: dict[str, StationPart]
 
+    def __repr__(self) -> str:
+        """Name the table; its arrays would fill the screen."""
+        return f"Table({str(self.path)!r}, site {self.site.name!r}, {len(self.parts)} stations, {self.table_id[:12]})"
+
     @classmethod
     def open(cls, path: str | Path) -> "Table":
         """Map a table file.

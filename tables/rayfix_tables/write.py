@@ -89,6 +89,9 @@ def check_writable(path: Path) -> None:
         raise TableError(f"cannot write {path}: there is no folder {path.parent}; create it first")
     if not os.access(path.parent, os.W_OK):
         raise TableError(f"cannot write {path}: the folder {path.parent} is read-only; choose another")
+    if path.exists() and path.stat().st_size and not h5py.is_hdf5(path):
+        # A site file or a scene by a slip of the hand: only a table gives way to a table.
+        raise TableError(f"cannot write {path}: the file there is no table; give another name, or remove it first")
 
 
 def write_table(

@@ -5,11 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from scipy.stats import multivariate_normal
 
 from rayfix.cli import main
 from rayfix.density import credible_levels, marginal_density
+from rayfix.picture import save_picture
+from rayfix.plot import make_figure
+from rayfix_tables.errors import RayfixError
+from rayfix_tables.table import Table
 from tests.support.reports import REPORT
 
 
@@ -64,3 +69,20 @@ def test_an_unknown_layer_is_refused(capsys: pytest.CaptureFixture[str]):
         main(["plot", "t.h5", "r.json", "-o", "p.png", "--layers", "rays,beams"])
     assert end.value.code == 2
     assert "'beams' is no layer" in capsys.readouterr().err
+
+
+def test_the_scene_is_seen_from_above_and_not_in_a_mirror(hall_table_path: Path):
+    """To turn from x to y is to turn counter-clockwise; the hall's y runs to the right, so its x runs down."""
+    table = Table.open(hall_table_path)
+    (above, view), (beside, side) = make_figure(table).views
+    assert (view, side) == ((1, 0), (1, 2))
+    origin, x, y = above.transData.transform([(0.0, 0.0), (0.0, 1.0), (1.0, 0.0)])  # of scene points, y to the right
+    assert np.linalg.det([x - origin, y - origin]) > 0.0
+    low, high = beside.get_ylim()
+    assert low < high
+
+
+def test_a_picture_that_cannot_be_written_is_one_error(tmp_path: Path):
+    (tmp_path / "taken.png").mkdir()
+    with pytest.raises(RayfixError, match=r"cannot write .*taken\.png \(Is a directory\); give another name"):
+        save_picture(Figure(), tmp_path / "taken.png")

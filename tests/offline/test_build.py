@@ -360,7 +360,7 @@ def test_an_interrupted_build_leaves_only_finished_work(
 ) -> None:
     path = tmp_path / "t.h5"
     if former:
-        path.write_bytes(b"whatever was here")
+        path.write_bytes(b"\x89HDF\r\n\x1a\n, or what is left of a table")
     before = content(tmp_path)
     with pytest.raises(KeyboardInterrupt):
         build_table(site_path, path, jobs=2, progress=Stopped(fits))

@@ -105,14 +105,15 @@ def test_a_missing_key(site_document: Document, section: str, key: str) -> None:
     part = document[section]
     path = f"stations[0].{key}" if section == "stations" else f"{section}.{key}"
     del (part[0] if section == "stations" else part)[key]
-    assert refused(document) == f"{path} is missing"
+    assert refused(document) == f"{path} is missing: add it"
 
 
 @pytest.mark.parametrize("section", ["site", "stations"])
 def test_a_missing_section(site_document: Document, section: str) -> None:
     document = site_document()
     del document[section]
-    assert refused(document) == f"{section} is missing"
+    header = {"site": "[site]", "stations": "[[stations]]"}[section]
+    assert refused(document) == f"{section} is missing: add a section {header}"
 
 
 @pytest.mark.parametrize(
@@ -235,10 +236,10 @@ def test_an_empty_file(tmp_path: Path) -> None:
     path = tmp_path / "site.toml"
     path.touch()
     message = file_refused(path)
-    assert message == f"{path}: site is missing; stations is missing"
+    assert message == f"{path}: site is missing: add a section [site]; stations is missing: add a section [[stations]]"
 
 
 def test_problems_of_a_file_name_it(tmp_path: Path) -> None:
     path = tmp_path / "site.toml"
     path.write_text('[site]\nname = "a"\nscene = "a.glb"\n')
-    assert file_refused(path) == f"{path}: stations is missing"
+    assert file_refused(path) == f"{path}: stations is missing: add a section [[stations]]"

@@ -138,6 +138,22 @@ def test_millimetres_taken_for_metres(tmp_path: Path, write_site: WriteSite, clu
     assert twin_of(path).findings == ()
 
 
+@pytest.mark.parametrize("up", ["z", "y"])
+def test_the_wrong_axis_up_is_named(
+    tmp_path: Path, write_site: WriteSite, cluttered_scene: trimesh.Scene, up: str
+) -> None:
+    """Read with the other axis up, the room reaches from -3 to 0 m or from -5 to 0 m where the stations are above 0."""
+    if up == "y":
+        cluttered_scene.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2.0, [1.0, 0.0, 0.0]))
+    wrong = {"z": "y", "y": "z"}[up]
+    path = write_site(tmp_path, scene=cluttered_scene, stations=stations(*FREE), site={"scene_up": wrong})
+    errors = [message for message in messages(twin_of(path), "error") if message.startswith("station")]
+    assert len(errors) == len(FREE)
+    assert all(message.endswith(f'; set scene_up = "{up}": then all stations lie inside') for message in errors)
+    path = write_site(tmp_path, scene=cluttered_scene, stations=stations(*FREE), site={"scene_up": up})
+    assert messages(twin_of(path), "error") == []
+
+
 def test_a_toy_scene(tmp_path: Path, write_site: WriteSite, cluttered_scene: trimesh.Scene) -> None:
     cluttered_scene.apply_scale(0.1)
     twin = twin_of(write_site(tmp_path, scene=cluttered_scene, stations=stations((0.36, 0.04, 0.26))))

@@ -319,3 +319,10 @@ def test_a_damaged_update(make_content: Callable[..., Any], tmp_path: Path, dama
             group["cell_change"] = change[:-1] if damage == "short" else change.astype(np.float64)
     with pytest.raises(CorruptTableError, match="cell_change"):
         Table.open(path)
+
+
+def test_a_table_is_shown_in_a_line(make_content: Callable[..., Any], tmp_path: Path) -> None:
+    make_content(1).write(tmp_path / "t.h5")
+    table = Table.open(tmp_path / "t.h5")
+    assert "\n" not in repr(table)
+    assert all(part in repr(table) for part in ("t.h5", table.site.name, table.table_id[:12]))

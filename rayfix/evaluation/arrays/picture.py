@@ -10,6 +10,7 @@ from matplotlib.ticker import FuncFormatter
 
 from rayfix.evaluation.arrays.statistics import AngleErrors
 from rayfix.evaluation.arrays.study import ArrayStudy
+from rayfix.picture import save_picture
 
 _INK = "#2b2f36"
 _COLOURS = ("#3b7dd8", "#e08e2b", "#1a936f", "#d1495b")
@@ -52,4 +53,4 @@ def draw_angle_errors(path: str | Path, studies: Mapping[str, tuple[ArrayStudy, 
         axes.set_title(title, loc="left", fontsize=10, color=_INK)
     panels[0].set_ylabel("share of reports")
     panels[0].legend(frameon=False, fontsize=9, loc="upper left")
-    figure.savefig(path, dpi=130)
+    save_picture(figure, path)

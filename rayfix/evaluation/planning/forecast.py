@@ -73,6 +73,8 @@ class PlanSettings:
             raise RayfixError(f"the height is {self.height} m; give the transmitters' z in the scene")
         if self.draws < 1:
             raise RayfixError(f"the number of draws is {self.draws}; give 1 or more")
+        if self.seed < 0:
+            raise RayfixError(f"the seed is {self.seed}; give 0 or more")
         if self.timing != "none" and self.noise.range_stdev is None:
             raise RayfixError(f"the timing is '{self.timing}', but the deviation of a range is not given; give it in m")
 
@@ -189,6 +191,12 @@ def draw_places(
     tried[..., :2] += spacing * (rng.random((*tried.shape[:2], 2)) - 0.5)
     free = clear_of_solids(free_space, tried.reshape(-1, 3), margin=_MARGIN).reshape(tried.shape[:2])
     usable = free.sum(axis=1) >= count
+    if not len(middles):
+        width, depth = high - low
+        raise RayfixError(
+            f"squares of {spacing:g} m do not fit into the building of {width:.2f} x {depth:.2f} m; give a smaller "
+            "spacing"
+        )
     if not usable.any():
         bottom = float(free_space.origin[2])
         top = bottom + free_space.free.shape[2] * free_space.voxel_size

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rayfix.evaluation.planning.floor import slice_mesh
 from rayfix.evaluation.planning.forecast import PlanMap
+from rayfix.picture import save_picture
 from rayfix_tables.table import Table
 
 Array = NDArray[np.float64]
@@ -240,4 +241,4 @@ def _title(table: Table, plan: PlanMap) -> str:
 
 def _save(figure: Figure, path: str | Path, title: str) -> None:
     figure.suptitle(title, fontsize=11, color=_INK, x=0.01, ha="left")
-    figure.savefig(path, dpi=130)
+    save_picture(figure, path)

@@ -110,7 +110,7 @@ def _problem(root: type[WireModel], error: ErrorDetails, what: str) -> FieldProb
         text = context["text"]
     elif kind in ("extra_forbidden", "invalid_key"):
         known = [f.alias or name for name, f in owner.model_fields.items()] if owner else []
-        close = difflib.get_close_matches(str(path[-1])[:60], known, n=1)
+        close = difflib.get_close_matches(str(path[-1])[:60], known, n=1, cutoff=0.7)
         remedy = f"did you mean {close[0]}?" if close else f"leave it out or use one of {', '.join(known)}"
         text = f"is an unknown key; {remedy}"
     else:

@@ -1,6 +1,7 @@
 """``rayfix plan``."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,7 @@ def test_two_tables_are_compared(
         (["--height", "9"], "nothing is free at a height of 9.0 m"),
         (["--height", "1", "--azimuth-stdev-deg", "-1"], "azimuth_stdev is -0.0174"),
         (["--height", "1", "--draws", "0"], "the number of draws is 0"),
+        (["--height", "1", "--spacing-m", "50"], "squares of 50 m do not fit into the building of"),
     ],
 )
 def test_mistakes_are_one_line(
@@ -66,4 +68,12 @@ def test_a_map_that_is_no_picture_is_refused(
     capsys: pytest.CaptureFixture[str], screen_path: Path, tmp_path: Path
 ) -> None:
     assert main(["plan", str(screen_path), "-o", str(tmp_path / "map.txt"), "--height", "1"]) == 2
-    assert "a map is a picture; end its name in .png, .svg, .pdf" in capsys.readouterr().err
+    assert "map.txt is no name of a picture; end it in .png, .svg or .pdf" in capsys.readouterr().err
+
+
+def test_the_place_of_the_picture_is_checked_before_the_work(
+    capsys: pytest.CaptureFixture[str], screen_path: Path, tmp_path: Path
+) -> None:
+    assert main(["plan", str(screen_path), "-o", str(tmp_path / "no" / "map.png"), "--height", "1"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()  # and no bar
+    assert re.search(r"there is no folder .*no; create it first", line)
