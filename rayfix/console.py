@@ -176,6 +176,7 @@ def print_build_summary(summary: "BuildSummary") -> None:
         caption_justify="left",
         box=box.SIMPLE_HEAD,
         padding=(0, 0, 0, 1),
+        pad_edge=False,
     )
     for heading in ("", "cells", "filled", "tubes", "MB", "lost"):
         grid.add_column(heading, justify="right")
@@ -185,9 +186,9 @@ def print_build_summary(summary: "BuildSummary") -> None:
         grid.add_row(
             s.station_id,
             s.origin,
-            f"{s.num_cells:,}",
-            f"{s.num_filled_cells:,}",
-            f"{s.num_components:,}",
+            str(s.num_cells),
+            str(s.num_filled_cells),
+            str(s.num_components),
             f"{s.num_bytes / 1e6:.1f}",
             f"{s.lost_ray_share:.3%}",
             *(f"{share:.0%}" for share in s.coverage),
