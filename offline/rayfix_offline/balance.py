@@ -70,26 +70,6 @@ def balanced(level: Level, free_space: FreeSpace) -> Level:
     return replace(level, log_balance=log_balance.astype(np.float32))
 
 
-def shares(level: Level, free_space: FreeSpace) -> tuple[Array, Array]:
-    """Sum of the probabilities of all paths in each block of the free space.
-
-    Returns
-    -------
-    share : ndarray of shape (nx, ny, nz)
-        0 where nothing is free.
-    volume : ndarray of shape (nx, ny, nz), m3
-        Of the block's free part.
-    """
-    blocks = _blocks(free_space)
-    if not len(level.mixture):
-        return np.zeros_like(blocks.volume), blocks.volume
-    places = _places(level)
-    weight = places.weight
-    if len(level.log_balance):
-        weight = weight * np.exp(level.log_balance)
-    return _shares(weight, places, np.array(normal_points(_NUM_POINTS)), blocks), blocks.volume
-
-
 class _Places(NamedTuple):
     """Where the paths of each component lead, over all directions that may be measured.
 

@@ -9,13 +9,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from rayfix_offline.balance import balanced, shares
+from rayfix_offline.balance import balanced
 from rayfix_offline.cells import assemble_level, fit_cells
 from rayfix_offline.site import parse_site
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture, pack
+from tests.support.path_shares import path_shares
 from tests.support.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_boxes
 
 Array = NDArray[np.float64]
@@ -49,7 +50,7 @@ def open_space(size: tuple[int, int, int] = (40, 40, 40), voxel_size: float = 0.
 def test_shares_are_those_of_a_gaussian_in_closed_form() -> None:
     """Half of a component at a wall lies beyond it."""
     level = level_of(np.array([[0.0, 4.0, 4.0]]), np.array([1.0]), log_mass=3.0)
-    share, volume = shares(level, open_space())
+    share, volume = path_shares(level, open_space())
     # Times the window, a measurement in the middle of the cell with the noise that the window is for.
     noise = WINDOW**2 / WINDOW_RATIO**2
     area = np.repeat(level.grid.solid_angles, level.grid.ring_cells)[40]
@@ -68,7 +69,7 @@ def test_shares_are_those_of_a_gaussian_in_closed_form() -> None:
 def test_places_with_too_little_are_raised_and_those_with_too_much_lowered() -> None:
     mean = np.array([[2.0, 4.0, 4.0], [6.0, 4.0, 4.0]])
     level = level_of(mean, np.array([0.5, 0.5]), log_mass=0.0)
-    share, _ = shares(level, open_space())
+    share, _ = path_shares(level, open_space())
     # Shares of the first are far below 1 everywhere, those of the second far above.
     log_weight = np.array([np.log(1e-5), np.log1p(-1e-5)], np.float32)
     level = replace(level, mixture=replace(level.mixture, log_weight=log_weight))
@@ -84,7 +85,7 @@ def test_what_is_even_stays() -> None:
     lattice = np.stack(np.meshgrid(*[np.arange(-2.0, 10.1, 0.5)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     level = level_of(lattice, np.full(len(lattice), 0.5), log_mass=0.0)
     space = open_space()
-    share, _ = shares(level, space)
+    share, _ = path_shares(level, space)
     level = replace(level, cell_log_mass=level.cell_log_mass - np.log(share.mean()))
     log_balance = balanced(level, space).log_balance
     inside = ((lattice > 0.0) & (lattice < 8.0)).all(axis=1)
@@ -119,8 +120,8 @@ def room(
 
 def test_shares_of_a_room_come_closer_to_one(room: tuple[Level, FreeSpace]) -> None:
     level, space = room
-    before, volume = shares(level, space)
-    after, _ = shares(balanced(level, space), space)
+    before, volume = path_shares(level, space)
+    after, _ = path_shares(balanced(level, space), space)
     heard = (volume > 0.0) & (before > 0.3)
     assert volume[heard].sum() > 0.9 * volume.sum()  # two reflections reach all but a little
 
