@@ -12,8 +12,8 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from fit_study import write_warehouse
 from numpy.typing import NDArray
+from warehouse import write_warehouse
 
 from rayfix.evaluation.forward import ForwardSolver
 from rayfix.example.files import write_example
@@ -56,7 +56,6 @@ def main() -> None:
     results = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "warehouse").mkdir()
         sites = {"hall": write_example(folder / "hall"), "warehouse": write_warehouse(folder / "warehouse")}
         for site_name, path in sites.items():
             if path is None:

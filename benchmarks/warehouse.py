@@ -1,0 +1,30 @@
+"""The warehouse of the studies: a real scene that lies beside the repository, and six stations in it."""
+
+from pathlib import Path
+
+WAREHOUSE_SCENE = Path(__file__).parents[2] / "shared" / "data" / "warehouse" / "warehouse_collision.ply"
+
+WAREHOUSE_STATIONS = {
+    "w1": (-4.5, -9.0, 4.5),
+    "w2": (5.5, -9.5, 4.8),
+    "w3": (6.0, 0.5, 4.2),
+    "w4": (6.0, 9.5, 4.6),
+    "w5": (-3.8, 9.3, 5.0),
+    "w6": (-3.5, 0.5, 4.0),
+}
+
+
+def write_warehouse(folder: Path) -> Path | None:
+    """Write the warehouse's site file; None where its scene is missing."""
+    if not WAREHOUSE_SCENE.exists():
+        return None
+    stations = "".join(
+        f'[[stations]]\nid = "{name}"\nposition_m = {list(position)}\n' for name, position in WAREHOUSE_STATIONS.items()
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "site.toml"
+    path.write_text(
+        f'[site]\nname = "warehouse"\nscene = "{WAREHOUSE_SCENE.resolve()}"\n{stations}',
+        encoding="utf-8",
+    )
+    return path
