@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rayfix_service.adapters.adapted import error_in_message
+from rayfix_service.adapters.adapted import check_stations, error_in_message
 from rayfix_service.adapters.formats import InputFormat, OutputFormat, parse, write
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import Height
@@ -48,6 +48,7 @@ def locate_file(
     except OSError as error:
         raise ReportError(f"{report_path} cannot be read ({error.strerror}); give a file with a report") from error
     table = Table.open(table_path)
+    check_stations(stations or {}, table.parts)
     locator = Locator(table)
     answers = []
     try:

@@ -5,9 +5,12 @@ import logging
 import signal
 from pathlib import Path
 
+from rayfix_service.adapters.adapted import check_stations
 from rayfix_service.adapters.mqtt import Broker, MqttSettings, check_settings, run_mqtt
 from rayfix_service.fusion.locator import Locator
 from rayfix_tables.table import Table
+
+_log = logging.getLogger(__name__)
 
 
 def serve_mqtt(table_path: Path, broker: Broker, settings: MqttSettings) -> None:
@@ -17,12 +20,16 @@ def serve_mqtt(table_path: Path, broker: Broker, settings: MqttSettings) -> None
     ------
     TableError
         When the table is missing, of another format, or damaged.
+    ReportError
+        When the map of stations names one that the table does not have.
     BrokerError
         When a setting is out of range, or the broker cannot be used.
     """
     logging.basicConfig(level=logging.INFO, format="%(levelname)s: %(message)s")
     check_settings(settings)
     table = Table.open(table_path)
+    check_stations(settings.stations, table.parts)
+    _log.info("loading %s; the first start after an installation compiles kernels, which takes a minute", table_path)
     table.verify()
     locator = Locator(table)
     locator.warm_up()
@@ -37,4 +44,4 @@ async def _until_told(locator: Locator, broker: Broker, settings: MqttSettings) 
     try:
         await work
     except asyncio.CancelledError:
-        logging.getLogger(__name__).info("told to end")
+        _log.info("told to end")

@@ -1,6 +1,6 @@
 """A foreign message as a report of this project, with the way back to its fields."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from pydantic import ValidationError
@@ -129,6 +129,21 @@ def station_map(pairs: Iterable[str]) -> dict[str, str]:
             )
         stations[name] = station
     return stations
+
+
+def check_stations(stations: Mapping[str, str], known: Collection[str]) -> None:
+    """Refuse a map to stations that a table does not have: it would be noticed with the first message only.
+
+    Raises
+    ------
+    ReportError
+    """
+    for name, station in stations.items():
+        if station not in known:
+            raise ReportError(
+                f"{name} is to be station '{station}', which is not in the table; it has {', '.join(known)}",
+                path=("station",),
+            )
 
 
 def known_height(z: float | None, stdev: float | None) -> Height | None:
