@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from rayfix_offline.check import Check
 
 
+_TABLE_STAGES = ("reading the scene", "balancing", "writing")
+"""Of a build, besides those of stations and levels."""
+
+
 @contextmanager
 def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
     """Show stage, rate, time that is left and memory on standard error."""
@@ -75,7 +79,7 @@ def evaluation_progress(*, enabled: bool) -> "Iterator[Callable[[str, int, int],
 
     def show(stage: str, done: int, total: int) -> None:
         # Stages of a table being built come by station and level; one bar stands for them.
-        name = stage if ":" not in stage and stage not in ("reading the scene", "writing") else "building tables"
+        name = "building tables" if ":" in stage or stage in _TABLE_STAGES else stage
         if not total:
             return
         bar.start()
@@ -101,7 +105,7 @@ def print_evaluation(results: Mapping[str, Any], page: Path) -> None:
     """Print the main figures of an evaluation and where its report is."""
     grid = Grid(title=f"{results['site']}: error of the position, m", title_justify="left", box=box.SIMPLE_HEAD)
     grid.add_column("measured")
-    for heading in ("rayfix 50 %", "90 %", "paper's method 50 %", "90 %", "bound 50 %", "90 %"):
+    for heading in ("rayfix 50 %", "90 %", "paper 50 %", "90 %", "bound 50 %", "90 %"):
         grid.add_column(heading, justify="right")
     (study,) = [study for study in results["studies"] if study["key"] == "methods"]
     for point in study["points"]:
@@ -112,7 +116,7 @@ def print_evaluation(results: Mapping[str, Any], page: Path) -> None:
     console.print(grid)
     for statement in results["statements"]:
         verdict = "holds" if statement["holds"] else "does not hold"
-        console.print(f"{statement['method']}: {statement['claim']} [bold]{verdict}[/bold]", highlight=False)
+        console.print(f"[bold]{verdict:<13}[/bold]  {statement['method']}: {statement['claim']}", highlight=False)
     console.print(f"The report is {page}", highlight=False, soft_wrap=True)
 
 

@@ -1,8 +1,12 @@
-"""Files of pictures: what is wrong with a name is said before the work, and writing has one clear error."""
+"""What pictures share: how a plan lies, which names their files may have, and one clear error where writing fails."""
 
+import os
 from pathlib import Path
 
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 from rayfix_tables.errors import RayfixError
 
@@ -17,12 +21,31 @@ def check_picture(path: Path) -> None:
     Raises
     ------
     RayfixError
-        When the type is unknown, or there is no such folder.
+        When the type is unknown, or there is no such folder, or none to write in.
     """
     if path.suffix.lower() not in TYPES:
         raise RayfixError(f"{path} is no name of a picture; end it in {', '.join(TYPES[:-1])} or {TYPES[-1]}")
     if not path.parent.is_dir():
         raise RayfixError(f"cannot write {path}: there is no folder {path.parent}; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise RayfixError(f"cannot write {path}: the folder {path.parent} is read-only; choose another")
+
+
+def set_plan_limits(axes: Axes, along: int, low: ArrayLike, high: ArrayLike) -> None:
+    """Show a floor from above: where y runs to the right, x runs down, or the plan would be a mirror image.
+
+    Parameters
+    ----------
+    along : {0, 1}
+        Coordinate that runs to the right.
+    low, high : array_like of shape (2,) or more, m
+    """
+    low, high = np.asarray(low), np.asarray(high)
+    across = 1 - along
+    bottom, top = (low, high) if across == 1 else (high, low)
+    axes.set_xlim(low[along], high[along])
+    axes.set_ylim(bottom[across], top[across])
+    axes.set_aspect("equal")
 
 
 def save_picture(figure: Figure, path: str | Path) -> None:

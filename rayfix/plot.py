@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import ArrayLike, NDArray
 
-from rayfix.picture import save_picture
+from rayfix.picture import save_picture, set_plan_limits
 from rayfix_tables.table import Table
 
 _INK, _RAY, _FIX, _RIVAL, _TRUTH, _STATION = "#2b2f36", "#3b7dd8", "#d1495b", "#e9a5ae", "#1a936f", "#2b2f36"
@@ -89,13 +89,12 @@ def make_figure(table: Table) -> SceneFigure:
             axes.plot(*spot, marker="^", markersize=8, color=_STATION, linestyle="none")
             if vertical == across:
                 axes.annotate(station.id, spot, textcoords="offset points", xytext=(7, 5), color=_STATION, fontsize=9)
-        axes.set_xlim(bounds[0, along] - margin, bounds[1, along] + margin)
-        axes.set_ylim(bounds[0, vertical] - margin, bounds[1, vertical] + margin)
-        if vertical == 0:
-            axes.invert_yaxis()  # x runs down where y runs to the right: seen from above, and not in a mirror
-        axes.set_aspect("equal")
         axes.set_ylabel(f"{names[vertical]} [m]")
         axes.set_title(title, loc="left", fontsize=10, color=_INK)
+    set_plan_limits(above, along, bounds[0] - margin, bounds[1] + margin)
+    beside.set_xlim(bounds[0, along] - margin, bounds[1, along] + margin)
+    beside.set_ylim(bounds[0, 2] - margin, bounds[1, 2] + margin)
+    beside.set_aspect("equal")
     beside.set_xlabel(f"{names[along]} [m]")
     return SceneFigure(figure=figure, table=table, views=((above, (along, across)), (beside, (along, 2))))
 

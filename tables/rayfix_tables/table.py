@@ -189,7 +189,11 @@ def _damage_reported(path: Path) -> Iterator[None]:
 
 
 def _open_file(path: Path) -> h5py.File:
-    if not path.exists():
+    try:
+        missing = not path.exists()
+    except PermissionError:  # of a folder on the way
+        missing = False
+    if missing:
         raise TableError(f"there is no table at {path}; build one with 'rayfix build SITE.toml -o {path}'")
     if not os.access(path, os.R_OK):
         raise TableError(f"{path} cannot be read; ask its owner for the right to read it")

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from rayfix.cli import main
 from rayfix.density import credible_levels, marginal_density
-from rayfix.picture import save_picture
+from rayfix.picture import save_picture, set_plan_limits
 from rayfix.plot import make_figure
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table
@@ -69,6 +69,17 @@ def test_an_unknown_layer_is_refused(capsys: pytest.CaptureFixture[str]):
         main(["plot", "t.h5", "r.json", "-o", "p.png", "--layers", "rays,beams"])
     assert end.value.code == 2
     assert "'beams' is no layer" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_a_plan_is_no_mirror_image(along: int):
+    """To turn from x to y is to turn counter-clockwise, whichever of them runs to the right."""
+    axes = Figure().subplots()
+    set_plan_limits(axes, along, (-1.0, -2.0, 0.0), (3.0, 2.0, 1.0))
+    points = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])[:, [along, 1 - along]]
+    origin, x, y = axes.transData.transform(points)
+    assert np.linalg.det([x - origin, y - origin]) > 0.0
+    assert sorted(axes.get_ylim()) == [(-2.0, -1.0)[along], (2.0, 3.0)[along]]
 
 
 def test_the_scene_is_seen_from_above_and_not_in_a_mirror(hall_table_path: Path):

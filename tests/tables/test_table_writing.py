@@ -145,9 +145,9 @@ from rayfix_tables.write import check_writable
 
 if os.getuid() == 0:
     os.setuid(65534)
-for action in (check_writable, Table.open):
+for action, path in ((check_writable, sys.argv[1]), (Table.open, sys.argv[1]), (Table.open, sys.argv[2])):
     try:
-        action(Path(sys.argv[1]))
+        action(Path(path))
     except TableError as error:
         print(error)
 """
@@ -159,6 +159,8 @@ def test_rights_that_are_missing(tmp_path_factory: pytest.TempPathFactory, make_
     path = folder / "t.h5"
     make_content(1).write(path)
     path.chmod(0)
+    closed = folder / "closed" / "t.h5"
+    closed.parent.mkdir(mode=0)
     parents = [p for p in (folder, *folder.parents) if p.owner() == folder.owner() and not p.stat().st_mode & 0o001]
     modes = {parent: parent.stat().st_mode for parent in parents}
     if os.getuid() == 0:
@@ -167,15 +169,21 @@ def test_rights_that_are_missing(tmp_path_factory: pytest.TempPathFactory, make_
     folder.chmod(0o555)
     try:
         done = subprocess.run(
-            [sys.executable, "-c", READ_ONLY, str(path)], capture_output=True, text=True, check=True, timeout=60
+            [sys.executable, "-c", READ_ONLY, str(path), str(closed)],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60,
         )
     finally:
         folder.chmod(0o755)
+        closed.parent.chmod(0o755)
         for parent, mode in modes.items():
             parent.chmod(mode)
     assert done.stdout.splitlines() == [
         f"cannot write {path}: the folder {folder} is read-only; choose another",
         f"{path} cannot be read; ask its owner for the right to read it",
+        f"{closed} cannot be read; ask its owner for the right to read it",
     ]
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rayfix.evaluation.planning.floor import slice_mesh
 from rayfix.evaluation.planning.forecast import PlanMap
-from rayfix.picture import save_picture
+from rayfix.picture import save_picture, set_plan_limits
 from rayfix_tables.table import Table
 
 Array = NDArray[np.float64]
@@ -189,11 +189,7 @@ def _draw_panel(figure: Figure, axes: Axes, table: Table, plan: PlanMap, quantit
             bbox={"boxstyle": "round,pad=0.15", "facecolor": _PAPER, "edgecolor": "none", "alpha": 0.8},
         )
     margin = 0.02 * float((high - low).max())
-    axes.set_xlim(low[along] - margin, high[along] + margin)
-    axes.set_ylim(low[1 - along] - margin, high[1 - along] + margin)
-    if along == 1:
-        axes.invert_yaxis()  # with y to the right, x downwards is the view from above, and upwards its mirror image
-    axes.set_aspect("equal")
+    set_plan_limits(axes, along, low - margin, high + margin)
     axes.set_xlabel(f"{'xy'[along]} [m]", fontsize=8)
     axes.set_ylabel(f"{'xy'[1 - along]} [m]", fontsize=8)
     axes.tick_params(labelsize=8)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rayfix.evaluation.report.geometry import Backdrop
 from rayfix.evaluation.report.style import INK, MUTED, new_figure
+from rayfix.picture import set_plan_limits
 
 __all__ = ["planning_chart"]
 
@@ -75,6 +76,4 @@ def _furnish(axes: Axes, scene: Backdrop, planning: Document, along: int) -> Non
     for spot in scene.stations.values():
         axes.plot(*spot[pick], marker="^", color="#d1495b", markeredgecolor=MUTED, markersize=7, linestyle="none")
     axes.grid(visible=False)
-    axes.set_xlim(scene.low[pick[0]], scene.high[pick[0]])
-    axes.set_ylim(scene.low[pick[1]], scene.high[pick[1]])
-    axes.set_aspect("equal")
+    set_plan_limits(axes, along, scene.low, scene.high)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rayfix.evaluation.report.geometry import Backdrop, ellipsoids, unit_sphere
 from rayfix.evaluation.report.style import INK, MUTED, STATIONS, new_figure
+from rayfix.picture import set_plan_limits
 
 __all__ = ["plane_picture", "space_picture"]
 
@@ -114,9 +115,7 @@ def plane_picture(scene: Backdrop, pictures: Pictures) -> Figure:
         axes.plot(*spot, "x", color=ESTIMATE, markersize=9, markeredgewidth=2, label="arg max of the product")
     truth = np.array(pictures["truth"])[pick]
     axes.plot(*truth, "+", color=TRUTH, markersize=13, markeredgewidth=2, label="true position")
-    axes.set_xlim(scene.low[pick[0]], scene.high[pick[0]])
-    axes.set_ylim(scene.low[pick[1]], scene.high[pick[1]])
-    axes.set_aspect("equal")
+    set_plan_limits(axes, along, scene.low, scene.high)
     axes.grid(visible=False)
     axes.set_xlabel(f"{'xy'[pick[0]]} [m]")
     axes.set_ylabel(f"{'xy'[pick[1]]} [m]")

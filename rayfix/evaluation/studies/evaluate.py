@@ -227,6 +227,7 @@ class _Runner:
             settings = replace(
                 settings, radio_map=simulate_map(Table.open(settings.tables[SITE]), spacing=self.spacing)
             )
+            self.progress("mapping fingerprints", 1, 1)
         for finished in run_tasks(settings, missing, jobs=self.jobs, advance=advance):
             content = {
                 "run": finished.run.document(),
