@@ -78,6 +78,16 @@ def _number(text: str, kind: Callable[[str], _Number], fits: Callable[[_Number],
     raise argparse.ArgumentTypeError(f"{text!r} {otherwise}")
 
 
+def add_jobs_argument(command: argparse.ArgumentParser, what: str) -> None:
+    """Add the option of how many processes work at a time."""
+    command.add_argument("--jobs", type=job_count, default=-1, metavar="N", help=f"{what} (default: one per core)")
+
+
+def add_progress_argument(command: argparse.ArgumentParser) -> None:
+    """Add the option of commands that take a while."""
+    command.add_argument("--no-progress", action="store_true", help="show no progress bar")
+
+
 def add_output_arguments(command: argparse.ArgumentParser) -> None:
     """Add the options of how an answer is written, and of what the report leaves out."""
     command.add_argument("--output", choices=_OUTPUTS, default="native", help="format of the answer (default: native)")

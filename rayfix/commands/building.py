@@ -6,7 +6,7 @@ import json
 import sys
 from pathlib import Path
 
-from rayfix.commands.arguments import AddCommand, job_count, mass_share
+from rayfix.commands.arguments import AddCommand, add_jobs_argument, add_progress_argument, mass_share
 from rayfix.extras import needs_extra
 
 
@@ -18,8 +18,8 @@ def add_commands(add: AddCommand) -> None:
 
     build = add("build", _build, "build the table of a site")
     build.add_argument("site", type=Path, metavar="SITE.toml")
-    build.add_argument("-o", "--output", type=Path, required=True, metavar="T.h5")
-    build.add_argument("--jobs", type=job_count, default=-1, help="cells fitted at a time (default: one per core)")
+    build.add_argument("-o", "--output", type=Path, required=True, metavar="T.h5", help="where the table goes")
+    add_jobs_argument(build, "cells fitted at a time")
     build.add_argument("--cluster", metavar="ADDRESS", help="let the workers of this Dask scheduler fit the cells")
     build.add_argument("--former", type=Path, metavar="OLD.h5", help="table to take over from (default: one at T.h5)")
     build.add_argument(
@@ -30,7 +30,7 @@ def add_commands(add: AddCommand) -> None:
         help="also keep cells of the former table whose rays have changed by this share at most, e.g. 0.01; "
         "the table is then no longer exactly that of a whole build, and says so (default: 0)",
     )
-    build.add_argument("--no-progress", action="store_true", help="show no progress bar")
+    add_progress_argument(build)
     build.add_argument("--json", action="store_true", help="print the summary as JSON")
 
     info = add("info", _info, "show what a table holds")

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rayfix.commands.arguments import AddCommand, job_count
+from rayfix.commands.arguments import AddCommand, add_jobs_argument
 from rayfix.extras import needs_extra
 
 
@@ -11,7 +11,7 @@ def add_commands(add: AddCommand) -> None:
     """Add the commands to the command line."""
     demo = add("demo", _demo, "run the whole main job on the bundled hall and draw a picture of the fix")
     demo.add_argument("-o", "--output", type=Path, default=Path("demo"), metavar="DIR", help="folder (default: demo)")
-    demo.add_argument("--jobs", type=job_count, default=-1, help="cells fitted at a time (default: one per core)")
+    add_jobs_argument(demo, "cells fitted at a time")
 
     example = add("example", _example, "write the bundled hall: hall.glb, site.toml, report.json")
     example.add_argument("folder", type=Path, metavar="DIR")

@@ -4,7 +4,13 @@ import argparse
 import json
 from pathlib import Path
 
-from rayfix.commands.arguments import AddCommand, drop_count, job_count, seed_number
+from rayfix.commands.arguments import (
+    AddCommand,
+    add_jobs_argument,
+    add_progress_argument,
+    drop_count,
+    seed_number,
+)
 from rayfix.extras import needs_extra
 
 
@@ -25,7 +31,7 @@ def add_commands(add: AddCommand) -> None:
     plan.add_argument("--threshold-m", type=float, default=1.0, metavar="M", help="largest useful error (default: 1)")
     plan.add_argument("--draws", type=int, default=4, help="reports from each square (default: 4)")
     plan.add_argument("--seed", type=seed_number, default=1, help="of places and noise (default: 1)")
-    plan.add_argument("--no-progress", action="store_true", help="show no progress bar")
+    add_progress_argument(plan)
     plan.add_argument("--json", action="store_true", help="print the map as JSON, one line for each table")
 
     evaluate = add("evaluate", _evaluate, "measure how well a site can be located in, and write a report")
@@ -39,8 +45,8 @@ def add_commands(add: AddCommand) -> None:
     evaluate.add_argument(
         "--seed", type=seed_number, default=2026, help="the same seed gives the same results (default: 2026)"
     )
-    evaluate.add_argument("--jobs", type=job_count, default=-1, help="processes (default: one per core)")
-    evaluate.add_argument("--no-progress", action="store_true", help="show no progress bar")
+    add_jobs_argument(evaluate, "processes")
+    add_progress_argument(evaluate)
 
 
 def _plan(options: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ def add_commands(add: AddCommand) -> None:
     view = add("view", _view, "write the viewer with a site and the fixes of a file into one HTML page")
     view.add_argument("table", type=Path, metavar="T.h5")
     view.add_argument("report", type=Path, nargs="?", metavar="REPORT.json", help="a report, or {'reports': [...]}")
-    view.add_argument("-o", "--output", type=Path, required=True, metavar="FIX.html")
+    view.add_argument("-o", "--output", type=Path, required=True, metavar="FIX.html", help="the page")
 
     plot = add("plot", _plot, "draw a report in its scene: rays, points, mixtures, posterior and fix")
     plot.add_argument("table", type=Path, metavar="T.h5")

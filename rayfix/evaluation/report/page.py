@@ -236,7 +236,8 @@ def _methods(evaluation: Evaluation, by_key: Mapping[str, str]) -> str:
         )
     table = (
         '<div class="scroll"><table><caption>The same drops and noise for all. Gross: more than a metre and five '
-        "bounds off. Times are medians of one thread of the machine that ran this, which was not idle.</caption>"
+        "bounds off. Times are medians of one thread's processor time; other work on the machine lengthens them."
+        "</caption>"
         "<thead><tr><th></th><th>50th</th><th>90th</th><th>95th</th><th>gross</th><th>no position</th>"
         f"<th>error /<br>bound</th><th>ms</th></tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
     )
