@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -139,13 +138,17 @@ def _joint_lengths(observation: Observation) -> list[Term]:
     return [product(terms, observation.length_bias_variance) for terms in itertools.product(*observation.lengths)]
 
 
-def _joint_readings(readings: tuple[ClockReading, ...]) -> Iterator[tuple[float, list[tuple[int, float, float]]]]:
-    """Combine the Gaussians that readings may be of, each with the logarithm of their probability."""
-    for spreads in itertools.product(*(reading.spreads for reading in readings)):
-        yield (
-            sum(spread.log_weight for spread in spreads),
+def _joint_readings(readings: tuple[ClockReading, ...]) -> list[tuple[float, list[tuple[int, float, float]]]]:
+    """Combine the Gaussians that readings may be of, each time with the logarithm of the probability."""
+    if not readings:
+        return [(0.0, [])]
+    return [
+        (
+            sum([spread.log_weight for spread in spreads]),
             [(r.clock, r.offset, r.variance * s.scale**2) for r, s in zip(readings, spreads, strict=True)],
         )
+        for spreads in itertools.product(*(reading.spreads for reading in readings))
+    ]
 
 
 def _variances(observation: Observation) -> list[float]:

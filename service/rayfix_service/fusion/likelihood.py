@@ -102,7 +102,7 @@ def product(terms: Sequence[Term], shared_variance: float) -> Term:
         At least one.
     """
     if len(terms) == 1:
-        return terms[0]._replace(variance=terms[0].variance + shared_variance)
+        return Term(terms[0].log_weight, terms[0].value, terms[0].variance + shared_variance)
     precision = sum(1.0 / term.variance for term in terms)
     value = sum(term.value / term.variance for term in terms) / precision
     log_weight = 0.5 * (_LOG_2PI - math.log(precision))
