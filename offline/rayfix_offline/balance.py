@@ -128,12 +128,7 @@ def _places(level: Level) -> _Places:
         cells = slice(first, last)
         log_evidence, at, cov = np.empty(end - begin), np.empty((end - begin, 4)), np.empty((end - begin, 4, 4))
         condition_on_angle(
-            mixture.log_weight,
-            mixture.u_mean,
-            mixture.u_cov,
-            mixture.x_mean,
-            mixture.jacobian,
-            mixture.x_cov,
+            *mixture.tubes,
             np.asarray(level.cell_offsets[:-1][cells], np.int64),
             np.asarray(level.cell_offsets[1:][cells], np.int64),
             np.zeros((last - first, 2)),

@@ -30,7 +30,7 @@ def condition_on_angle(
     Parameters
     ----------
     log_weight, u_mean, u_cov, x_mean, jacobian, x_cov : ndarray
-        Fields of a :class:`~rayfix_tables.mixture.TubeMixture`.
+        The ``tubes`` of a :class:`~rayfix_tables.mixture.TubeMixture`.
     begins, ends : ndarray of int64, shape (n,)
         Components of cell ``c`` are those from ``begins[c]`` to ``ends[c]``.
     rest_mean : ndarray of shape (n, 2), rad

@@ -105,6 +105,11 @@ class TubeMixture:
         """Return the number of components."""
         return len(self.log_weight)
 
+    @property
+    def tubes(self) -> tuple[NDArray[Any], ...]:
+        """Arrays that :func:`~rayfix_tables.conditioning.condition_on_angle` begins with."""
+        return self.log_weight, self.u_mean, self.u_cov, self.x_mean, self.jacobian, self.x_cov
+
     def __getitem__(self, index: slice | NDArray[np.int64]) -> "TubeMixture":
         """Components of a range, without a copy, or those of the given numbers."""
         return TubeMixture(**{name: getattr(self, name)[index] for name in FIELD_SHAPES})

@@ -95,15 +95,10 @@ class HeardStation:
 
 def _condition(lookup: Lookup) -> Heard:
     """Condition every component of the cells looked up on the rest of the measured angle."""
-    level, mixture = lookup.level, lookup.level.mixture
+    level = lookup.level
     return Heard(
         *_condition_cells(
-            mixture.log_weight,
-            mixture.u_mean,
-            mixture.u_cov,
-            mixture.x_mean,
-            mixture.jacobian,
-            mixture.x_cov,
+            *level.mixture.tubes,
             level.log_balance,
             level.cell_offsets,
             level.cell_log_mass,
