@@ -179,15 +179,28 @@ def build_table(
 
 
 def _balanced(stations: list[BuiltStation], site: SiteFile, twin: Twin, jobs: int) -> list[BuiltStation]:
-    """Balance all levels, if their prior makes the probabilities of the paths to a place add up to 1."""
+    """Balance all levels, if their prior makes the probabilities of the paths to a place add up to 1.
+
+    A part that was kept whole is of the same free space, so that its balance holds.
+    """
     if site.propagation.path_prior != "power":
         return stations
-    levels = [level for station in stations for level in station.content.levels]
+    levels = [level for station in stations if not _keeps_balance(station) for level in station.content.levels]
     done = iter(Parallel(n_jobs=jobs, prefer="threads")(delayed(balanced)(level, twin.free_space) for level in levels))
     return [
-        replace(station, content=replace(station.content, levels=tuple(next(done) for _ in station.content.levels)))
+        station
+        if _keeps_balance(station)
+        else replace(
+            station, content=replace(station.content, levels=tuple(next(done) for _ in station.content.levels))
+        )
         for station in stations
     ]
+
+
+def _keeps_balance(station: BuiltStation) -> bool:
+    """Whether a station's part comes from a former table, balanced; tables of early versions are not."""
+    levels = station.content.levels
+    return station.origin == "kept" and all(len(level.log_balance) == len(level.mixture) for level in levels)
 
 
 def _connect(address: str, site: SiteFile, twin: Twin) -> "Cluster":

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rayfix_offline import build
 from rayfix_offline.build import BuildSummary, build_table
 from rayfix_offline.shards import ShardStore
 from rayfix_tables.errors import BuildError
@@ -186,6 +187,22 @@ def test_a_bias_rebuilds_nothing(tmp_path: Path, whole: BuildSummary) -> None:
     assert (biases["c"].range, biases["c"].azimuth) == (0.25, pytest.approx(np.deg2rad(2.0)))
     assert biases["a"] == biases["b"] == NO_BIAS
     assert build_table(write_site(tmp_path, STATIONS), table, jobs=1).table_id == whole.table_id
+
+
+def test_a_balance_is_kept_with_its_part_and_made_where_there_is_none(
+    tmp_path: Path, whole: BuildSummary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site, table = write_site(tmp_path, STATIONS), tmp_path / "t.h5"
+    with monkeypatch.context() as early:
+        early.setattr(build, "balanced", lambda level, free_space: level)  # as the first tables were
+        unbalanced = build_table(site, table, jobs=1)
+    assert unbalanced.table_id != whole.table_id
+    again = build_table(site, table, jobs=1)
+    assert set(origins(again).values()) == {"kept"}
+    assert again.table_id == whole.table_id
+    with monkeypatch.context() as idle:
+        idle.setattr(build, "balanced", lambda level, free_space: pytest.fail("balanced anew"))
+        assert build_table(site, table, jobs=1).table_id == whole.table_id
 
 
 def test_another_scene_or_seed(tmp_path: Path, whole: BuildSummary) -> None:
