@@ -1,7 +1,7 @@
 """Many reports in one call, on several processor cores.
 
-A fix is half compiled loops and half Python, which one thread of a process runs at a time, so that threads gain
-nothing; processes do. Each maps the table's file, which they therefore share in memory.
+A third of a fix is Python, which one thread of a process runs at a time, so that threads gain little; processes do.
+Each maps the table's file, which they therefore share in memory.
 """
 
 import gc
@@ -56,21 +56,6 @@ def locate_batch(
         return _locate_all(locator, reports, jobs)
 
 
-@contextmanager
-def _collector_resting() -> Iterator[None]:
-    """Keep Python's collector of reference cycles from looking for them among answers, again and again as these grow.
-
-    Answers have none. The search through thousands of them takes a third of the time of a batch in several processes.
-    """
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
 def _locate_all(locator: Locator, reports: Sequence[Report | Mapping[str, Any]], jobs: int) -> list[Fix | ReportError]:
     blocks = [reports[begin : begin + _BLOCK] for begin in range(0, len(reports), _BLOCK)]
     jobs = min(effective_n_jobs(jobs), len(blocks))
@@ -111,3 +96,18 @@ def _locator(path: Path, table_id: str, settings: FusionSettings) -> Locator:
     if table.table_id != table_id:
         raise TableError(f"{path} has become another table since it was opened; open it again")
     return Locator(table, settings)
+
+
+@contextmanager
+def _collector_resting() -> Iterator[None]:
+    """Keep Python's collector of reference cycles from looking for them among answers, again and again as these grow.
+
+    Answers have none. The search through thousands of them takes a third of the time of a batch in several processes.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
