@@ -14,6 +14,7 @@ with needs_extra("service"):
     from rayfix_service.fusion.locator import Locator as _Locator
     from rayfix_service.fusion.posterior import Posterior
     from rayfix_service.fusion.report import Fix, Report
+    from rayfix_service.fusion.settings import FusionSettings
     from rayfix_service.impulse_response import range_from_impulse_response
     from rayfix_service.ranging import range_from_round_trip, range_from_rssi, range_from_times
     from rayfix_service.tracking.settings import TrackingSettings
@@ -71,7 +72,24 @@ def build(
 
 
 class Locator(_Locator):
-    """Answers reports from a table."""
+    """Answers reports from a table.
+
+    Parameters
+    ----------
+    table : Table
+        From :func:`build` or ``Table.open``.
+    settings : FusionSettings, optional
+
+    Raises
+    ------
+    TypeError
+        When the table is something else, such as the path of one.
+    """
+
+    def __init__(self, table: Table, settings: FusionSettings | None = None) -> None:
+        if not isinstance(table, Table):
+            raise TypeError(f"a Locator needs an open table, not {table!r}; open the file with rayfix.Table.open(path)")
+        super().__init__(table, settings)
 
     def locate(self, report: Report | Mapping[str, Any]) -> Fix:
         """Fuse the measurements of a report.

@@ -50,6 +50,11 @@ def test_a_tracker_goes_on_with_what_a_locator_fuses(hall_table_path: Path) -> N
     assert spreads[-1] < 0.7 * spreads[0]
 
 
+def test_the_path_of_a_table_is_no_table(hall_table_path: Path) -> None:
+    with pytest.raises(TypeError, match=r"open the file with rayfix\.Table\.open"):
+        rayfix.Locator(hall_table_path)  # type: ignore[arg-type]
+
+
 def test_a_locator_takes_a_dict_or_a_report(hall_table_path: Path) -> None:
     document = json.loads(example_report())
     locator = rayfix.Locator(rayfix.Table.open(hall_table_path))
