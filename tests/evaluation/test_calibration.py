@@ -8,6 +8,7 @@ from scipy.stats import binomtest
 from rayfix.evaluation.accuracy import Drop, LocatedDrop
 from rayfix.evaluation.calibration import calibrate, ellipsoid_holds, wilson_interval
 from rayfix_service.fusion.credible import CredibleRegions
+from rayfix_service.fusion.points import ListedPoints
 from rayfix_service.fusion.report import Candidate, Fix
 from rayfix_tables.normal import normal_points
 
@@ -19,7 +20,7 @@ def fix_of(*positions: NDArray[np.float64], cov: NDArray[np.float64] = COV) -> F
         Candidate(probability=1.0 / (n + 2), position=position, covariance=cov) for n, position in enumerate(positions)
     )
     points = positions[0] + normal_points(1024) @ np.linalg.cholesky(cov).T
-    regions = CredibleRegions(position=positions[0], covariance=cov, points=points, share=1.0)
+    regions = CredibleRegions(position=positions[0], covariance=cov, points=ListedPoints(position=points), share=1.0)
     return Fix(status="ok", candidates=candidates, outcomes=(), log_evidence=0.0, table_id="", regions=regions)
 
 

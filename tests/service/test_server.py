@@ -12,6 +12,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -23,6 +24,12 @@ from rayfix_service.http.settings import ServiceSettings
 from rayfix_tables.errors import NotATableError, TableError
 from tests.support.reports import REPORT
 from tests.support.server_process import start_server
+
+
+def wide_report() -> dict[str, Any]:
+    """Angles of all stations, so uncertain that a fix takes some milliseconds."""
+    angle = {"type": "aoa", "azimuth_deg": 30, "azimuth_stdev_deg": 10, "zenith_deg": 95, "zenith_stdev_deg": 10}
+    return {"measurements": [angle | {"station_id": f"bs{n}"} for n in (1, 2, 3, 4)]}
 
 
 def test_a_real_server_answers_and_ends(hall_table_path: Path):
@@ -47,7 +54,7 @@ def test_a_real_server_answers_and_ends(hall_table_path: Path):
                 answers += connection.recv(1 << 16)
             assert found == [b"first", b"second"]
         # A client that leaves within its body is no error, and one that leaves its batch ends that.
-        batch = json.dumps({"reports": [REPORT] * 1000})
+        batch = json.dumps({"reports": [wide_report()] * 1000})
         for path, length, body in [
             ("/v1/positions", 99, "{"),
             ("/v1/positions/batch", len(batch), batch),
