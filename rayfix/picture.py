@@ -1,6 +1,5 @@
 """What pictures share: how a plan lies, which names their files may have, and one clear error where writing fails."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from rayfix_tables.errors import RayfixError
+from rayfix_tables.write import check_folder
 
 TYPES = (".png", ".svg", ".pdf")
 
@@ -25,10 +25,7 @@ def check_picture(path: Path) -> None:
     """
     if path.suffix.lower() not in TYPES:
         raise RayfixError(f"{path} is no name of a picture; end it in {', '.join(TYPES[:-1])} or {TYPES[-1]}")
-    if not path.parent.is_dir():
-        raise RayfixError(f"cannot write {path}: there is no folder {path.parent}; create it first")
-    if not os.access(path.parent, os.W_OK):
-        raise RayfixError(f"cannot write {path}: the folder {path.parent} is read-only; choose another")
+    check_folder(path, RayfixError)
 
 
 def set_plan_limits(axes: Axes, along: int, low: ArrayLike, high: ArrayLike) -> None:

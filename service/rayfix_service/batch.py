@@ -102,7 +102,7 @@ def _locator(path: Path, table_id: str, settings: FusionSettings) -> Locator:
 def _collector_resting() -> Iterator[None]:
     """Keep Python's collector of reference cycles from looking for them among answers, again and again as these grow.
 
-    Answers have none. The search through thousands of them takes a third of the time of a batch in several processes.
+    Answers have none. The search through thousands of them takes a fifth of the time of a batch in several processes.
     """
     enabled = gc.isenabled()
     gc.disable()

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.errors import TableError
+from rayfix_tables.errors import RayfixError, TableError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES
@@ -75,6 +75,14 @@ class SceneContent:
     sha256: str
 
 
+def check_folder(path: Path, error: type[RayfixError]) -> None:
+    """Raise an error of a kind when the folder of a file to come is missing or read-only."""
+    if not path.parent.is_dir():
+        raise error(f"cannot write {path}: there is no folder {path.parent}; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise error(f"cannot write {path}: the folder {path.parent} is read-only; choose another")
+
+
 def check_writable(path: Path) -> None:
     """Fail before the work is done rather than after.
 
@@ -85,10 +93,7 @@ def check_writable(path: Path) -> None:
     """
     if path.is_dir():
         raise TableError(f"cannot write {path}: it is a folder; give a file name such as {path / 'table.h5'}")
-    if not path.parent.is_dir():
-        raise TableError(f"cannot write {path}: there is no folder {path.parent}; create it first")
-    if not os.access(path.parent, os.W_OK):
-        raise TableError(f"cannot write {path}: the folder {path.parent} is read-only; choose another")
+    check_folder(path, TableError)
     if path.exists() and path.stat().st_size and not h5py.is_hdf5(path):
         # A site file or a scene by a slip of the hand: only a table gives way to a table.
         raise TableError(f"cannot write {path}: the file there is no table; give another name, or remove it first")

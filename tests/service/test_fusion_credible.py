@@ -290,7 +290,7 @@ def test_points_are_those_of_the_twin(seed: int) -> None:
     log_weight[5:8] = -20.0
     cov[3, 0, 0] = -1e-9
     space = FreeSpace(origin=np.array([-4.0, -3.0, -3.0]), voxel_size=0.5, free=rng.random((16, 12, 12)) < 0.6)
-    expected = reference.posterior_points(log_weight, mean, cov, space, POINTS)
+    expected = reference.draw_points(log_weight, mean, cov, space, POINTS)
     found = points_of(log_weight, mean, cov, space).places()
     assert 0.2 < len(found) / len(POINTS) < 0.6
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)  # m

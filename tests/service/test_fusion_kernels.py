@@ -298,7 +298,7 @@ def test_climb_equals_its_twin(seed: int) -> None:
     precision = np.asarray(np.linalg.inv(random_cov(rng, 20, [0.4, 0.6, 0.2])), np.float64)
     log_density = np.log(rng.dirichlet(np.ones(20))) + 0.5 * np.linalg.slogdet(precision)[1]
     for start in mean[:5]:
-        mode, curvature = modes.climb(log_density, mean, precision, start)
+        mode, curvature, _ = modes.climb(log_density, mean, precision, start, np.empty((0, 3)), np.empty((0, 3, 3)))
         expected_mode, expected_curvature = reference.climb(log_density, mean, precision, start)
         np.testing.assert_allclose(mode, expected_mode, rtol=0, atol=1e-7)  # m
         np.testing.assert_allclose(curvature, expected_curvature, rtol=1e-5)

@@ -27,7 +27,8 @@ def log_density(x: Array, weight: Array, mean: Array, cov: Array) -> Array:
 
 def climb_from(start: Array, weight: Array, mean: Array, cov: Array) -> Array:
     precision = np.linalg.inv(cov)
-    mode, _ = modes.climb(np.log(weight) + 0.5 * np.linalg.slogdet(precision)[1], mean, precision, start)
+    log_peak = np.log(weight) + 0.5 * np.linalg.slogdet(precision)[1]
+    mode, _, _ = modes.climb(log_peak, mean, precision, start, np.empty((0, 3)), np.empty((0, 3, 3)))
     return np.asarray(mode)
 
 

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from rayfix_service.fusion.kernels import cholesky
-from rayfix_service.fusion.voxels import is_free
+from rayfix_service.fusion.voxels import in_voxels, is_free
 
 _LEAST_FREE_SHARE = 1e-3
 """Weight that is left of a Gaussian which lies in a solid: the scene is not exact to the voxel."""
@@ -43,14 +43,11 @@ def cut_to_free_space(
     inside = np.empty(len(points), np.int64)
     for h in range(len(mean)):
         cholesky(cov[h], lower)
-        # In voxels.
-        x0, y0, z0 = (mean[h] - origin) / voxel_size
-        xx, yx, yy = lower[0, 0] / voxel_size, lower[1, 0] / voxel_size, lower[1, 1] / voxel_size
-        zx, zy, zz = lower[2, 0] / voxel_size, lower[2, 1] / voxel_size, lower[2, 2] / voxel_size
+        (x, y, z), (xx, yx, yy, zx, zy, zz) = in_voxels(mean[h], lower, origin, voxel_size)
         count = 0
         for n in range(len(points)):
             p, q, r = points[n, 0], points[n, 1], points[n, 2]
-            if is_free(free, x0 + xx * p, y0 + yx * p + yy * q, z0 + zx * p + zy * q + zz * r):
+            if is_free(free, x + xx * p, y + yx * p + yy * q, z + zx * p + zy * q + zz * r):
                 inside[count] = n
                 count += 1
         log_weight[h] += np.log(max(count / len(points), _LEAST_FREE_SHARE))

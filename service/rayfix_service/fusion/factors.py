@@ -21,8 +21,6 @@ from rayfix_service.fusion.sight import sight
 _ANY_LENGTH = Term(0.0, 0.0, math.inf)
 """Likelihood of a path length that was not measured."""
 
-_NO_READINGS = np.zeros(0, READING)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Factor:
@@ -87,7 +85,7 @@ def make_factor(
     columns, outlier = make_alternatives(
         *join(heard),
         np.array(parts, PART),
-        np.array(readings, READING) if readings else _NO_READINGS,
+        np.array(readings, READING),
         num_clocks,
         prior.precision,
         prior.eta,

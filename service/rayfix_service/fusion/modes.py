@@ -89,11 +89,8 @@ def _second_moments(weight: Any, mean: Any, cov: Any, member: Any, total: Any, p
 
 
 @numba.njit(cache=True, nogil=True)
-def climb(log_density: Any, mean: Any, precision: Any, start: Any) -> Any:
-    """Climb to a mode of a Gaussian mixture in three dimensions by the fixed point of its stationarity condition.
-
-    M. A. Carreira-Perpinan, "Mode-finding for mixtures of Gaussian distributions", IEEE Trans. PAMI 22 (11), 2000:
-    at a mode ``x = (sum r_h P_h)^-1 sum r_h P_h m_h`` with the responsibilities r_h at x.
+def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any) -> Any:
+    """Climb from each hypothesis, the densest first, and gather the hypotheses by the hill they come to.
 
     Parameters
     ----------
@@ -101,26 +98,6 @@ def climb(log_density: Any, mean: Any, precision: Any, start: Any) -> Any:
         Log weight plus half the log determinant of the precision.
     mean : ndarray of shape (h, 3), m
     precision : ndarray of shape (h, 3, 3), 1 / m2
-    start : ndarray of shape (3,), m
-
-    Returns
-    -------
-    mode : ndarray of shape (3,), m
-    curvature : ndarray of shape (3, 3), 1 / m2
-        Mean precision of the hypotheses there.
-    """
-    mode, curvature, _ = _climb(log_density, mean, precision, start, np.empty((0, 3)), np.empty((0, 3, 3)))
-    return mode, curvature
-
-
-@numba.njit(cache=True, nogil=True)
-def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any) -> Any:
-    """Climb from each hypothesis, the densest first, and gather the hypotheses by the hill they come to.
-
-    Parameters
-    ----------
-    log_density, mean, precision : ndarray
-        As in :func:`climb`.
     same_hill : float
         Two modes are one hill, though with two humps, when their squared distance is below this in what either is
         uncertain by.
@@ -138,7 +115,7 @@ def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any) -> Any:
     curvature = np.empty((count, 3, 3))
     found = 0
     for h in np.argsort(-log_density):
-        mode, here, hill = _climb(log_density, mean, precision, mean[h], top[:found], curvature[:found])
+        mode, here, hill = climb(log_density, mean, precision, mean[h], top[:found], curvature[:found])
         for n in range(found):
             if hill >= 0:
                 break
@@ -162,8 +139,29 @@ def _square(x: Any, y: Any, precision: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _climb(log_density: Any, mean: Any, precision: Any, start: Any, top: Any, curvature: Any) -> Any:
-    """Climb until a mode is reached, or the place where one of those found already attracts (its number comes last)."""
+def climb(log_density: Any, mean: Any, precision: Any, start: Any, top: Any, curvature: Any) -> Any:
+    """Climb to a mode of a Gaussian mixture by the fixed point of its stationarity condition.
+
+    M. A. Carreira-Perpinan, "Mode-finding for mixtures of Gaussian distributions", IEEE Trans. PAMI 22 (11), 2000:
+    at a mode ``x = (sum r_h P_h)^-1 sum r_h P_h m_h`` with the responsibilities r_h at x.
+
+    Parameters
+    ----------
+    log_density, mean, precision : ndarray
+        As in :func:`gather`.
+    start : ndarray of shape (3,), m
+    top : ndarray of shape (m, 3), m
+        Modes found already, the climb to which may be cut short.
+    curvature : ndarray of shape (m, 3, 3), 1 / m2
+        Mean precision of the hypotheses there.
+
+    Returns
+    -------
+    mode : ndarray of shape (3,), m
+    curvature : ndarray of shape (3, 3), 1 / m2
+    found : int
+        Which of the modes found already attracts here, -1 for none.
+    """
     count = len(log_density)
     x, step = start.copy(), np.empty(3)
     logs = np.empty(count)

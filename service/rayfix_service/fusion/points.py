@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.kernels import cholesky, log_sum
-from rayfix_service.fusion.voxels import is_free
+from rayfix_service.fusion.voxels import in_voxels, is_free
 from rayfix_tables.normal import normal_points
 
 IN_SOLID = -1
@@ -118,9 +118,7 @@ def draw_points(log_weight: Any, mean: Any, cov: Any, normal: Any, origin: Any, 
         if not cholesky(cov[h], lower):
             continue
         chosen[owners] = mean[h]
-        x, y, z = (mean[h] - origin) / voxel_size
-        xx, yx, yy = lower[0, 0] / voxel_size, lower[1, 0] / voxel_size, lower[1, 1] / voxel_size
-        zx, zy, zz = lower[2, 0] / voxel_size, lower[2, 1] / voxel_size, lower[2, 2] / voxel_size
+        (x, y, z), (xx, yx, yy, zx, zy, zz) = in_voxels(mean[h], lower, origin, voxel_size)
         while drawn < total and (last or (drawn + 0.5) / total <= reached):
             p, q, r = normal[drawn, 0], normal[drawn, 1], normal[drawn, 2]
             if is_free(free, x + xx * p, y + yx * p + yy * q, z + zx * p + zy * q + zz * r):

@@ -226,7 +226,7 @@ def cut_gaussian(mean: Array, cov: Array, points: Array, free_space: FreeSpace) 
     return cut_mean, cov, share
 
 
-def posterior_points(log_weight: Array, mean: Array, cov: Array, free_space: FreeSpace, normal_points: Array) -> Array:
+def draw_points(log_weight: Array, mean: Array, cov: Array, free_space: FreeSpace, normal_points: Array) -> Array:
     """Points of a mixture of Gaussians cut to the free space.
 
     The n-th normal point is of the Gaussian whose stretch of the summed weights holds (n + 1/2) / count. One with a

@@ -19,6 +19,25 @@ def is_free(free: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
+def in_voxels(mean: Any, lower: Any, origin: Any, voxel_size: Any) -> Any:
+    """Mean (x, y, z) and Cholesky factor (xx, yx, yy, zx, zy, zz) of a Gaussian in the units of :func:`is_free`."""
+    middle = (
+        (mean[0] - origin[0]) / voxel_size,
+        (mean[1] - origin[1]) / voxel_size,
+        (mean[2] - origin[2]) / voxel_size,
+    )
+    root = (
+        lower[0, 0] / voxel_size,
+        lower[1, 0] / voxel_size,
+        lower[1, 1] / voxel_size,
+        lower[2, 0] / voxel_size,
+        lower[2, 1] / voxel_size,
+        lower[2, 2] / voxel_size,
+    )
+    return middle, root
+
+
+@numba.njit(cache=True, nogil=True)
 def is_free_place(free: Any, origin: Any, voxel_size: Any, place: Any) -> Any:
     """Whether a place of shape (3,), m, lies in a free voxel."""
     x, y, z = place[0] - origin[0], place[1] - origin[1], place[2] - origin[2]
