@@ -27,11 +27,12 @@ from rayfix_offline import trace
 from rayfix_offline.cells import assemble_level, fit_cells, widen_cells
 from rayfix_offline.em import ExpectationMaximisation, fit_em
 from rayfix_offline.engine import RayEngine
-from rayfix_offline.launch import Segments, launch
+from rayfix_offline.launch import launch
 from rayfix_offline.moments import gather_groups, gathered_arrays, new_rows
 from rayfix_offline.pathprior import fill_path_prior
 from rayfix_offline.pieces import cut_pieces
 from rayfix_offline.rays import RaySet, sample_rays
+from rayfix_offline.segments import Segments
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.trace import LevelRays, StationTrace, level_grid, reflectivity_of, trace_station
 from rayfix_offline.tubes import TubeFit, fit_tubes

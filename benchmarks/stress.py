@@ -25,8 +25,8 @@ from rayfix.evaluation.stress import (
     with_turned_stations,
 )
 from rayfix.evaluation.tables import open_or_build, table_parser
+from rayfix_service.fusion.fix import Fix
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import Fix
 from rayfix_service.wire import parse_report
 from rayfix_tables.table import Table
 

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from rayfix.evaluation.calibration import ellipsoid_holds
 from rayfix.evaluation.uwb import ANCHORS, Ranging, least_squares, read_ranging, site_text
 from rayfix_offline.build import build_table
+from rayfix_service.fusion.fix import Fix
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import Fix, Height, Range, Report
+from rayfix_service.fusion.report import Height, Range, Report
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.table import Table
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from rayfix.api import build as build
     from rayfix.client import AsyncClient as AsyncClient
     from rayfix.client import Client as Client
+    from rayfix_service.fusion.fix import Fix as Fix
     from rayfix_service.fusion.posterior import Posterior as Posterior
-    from rayfix_service.fusion.report import Fix as Fix
     from rayfix_service.fusion.report import Report as Report
     from rayfix_service.impulse_response import range_from_impulse_response as range_from_impulse_response
     from rayfix_service.ranging import range_from_round_trip as range_from_round_trip

@@ -10,10 +10,11 @@ from rayfix_tables.table import Table
 
 with needs_extra("service"):
     from rayfix_service.batch import locate_batch
+    from rayfix_service.fusion.fix import Fix
     from rayfix_service.fusion.locator import Fused
     from rayfix_service.fusion.locator import Locator as _Locator
     from rayfix_service.fusion.posterior import Posterior
-    from rayfix_service.fusion.report import Fix, Report
+    from rayfix_service.fusion.report import Report
     from rayfix_service.fusion.settings import FusionSettings
     from rayfix_service.impulse_response import range_from_impulse_response
     from rayfix_service.ranging import range_from_round_trip, range_from_rssi, range_from_times

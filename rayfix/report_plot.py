@@ -15,10 +15,9 @@ from rayfix.density import credible_levels, marginal_density
 from rayfix.evaluation.paper.points import Launcher, RayPoints, draw_directions, points_on_rays
 from rayfix.evaluation.paper.selection import select_by_length
 from rayfix.plot import SceneFigure, draw_candidates, draw_truth, make_figure
-from rayfix_service.fusion.directions import to_scene, without_bias
+from rayfix_service.fusion.directions import Direction, to_scene, without_bias
 from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.lookup import Direction
 from rayfix_service.fusion.report import Angle, Range, Report
 from rayfix_tables.table import Table
 

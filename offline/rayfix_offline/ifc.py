@@ -14,7 +14,7 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 
 from rayfix_offline.materials import itu_name
-from rayfix_offline.mitsuba import Placed
+from rayfix_offline.placed import Placed
 from rayfix_tables.errors import SceneError
 
 if TYPE_CHECKING:

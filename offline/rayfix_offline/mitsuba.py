@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 from trimesh.visual.material import PBRMaterial
 
 from rayfix_offline.materials import itu_name
+from rayfix_offline.placed import Placed
 from rayfix_tables.errors import SceneError
-
-Placed = tuple[str, Any, NDArray[np.float64]]
-"""Name, mesh and transform of an object."""
 
 _LARGEST = 1e9
 _UNREADABLE = "export the scene again, with a Mitsuba exporter"

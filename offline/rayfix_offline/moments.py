@@ -10,9 +10,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import Sequences
 from rayfix_offline.pieces import Pieces
 from rayfix_offline.rays import RaySet
+from rayfix_offline.segments import Sequences
 
 SIZE = 6
 """Length of the joint vector."""

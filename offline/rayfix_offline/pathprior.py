@@ -12,8 +12,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import Segments, turned
+from rayfix_offline.launch import turned
 from rayfix_offline.rays import RaySet
+from rayfix_offline.segments import Segments
 from rayfix_offline.voxelwalk import GAUSS, new_crossings, over_ray_ranges, power, walk
 from rayfix_tables.freespace import FreeSpace
 

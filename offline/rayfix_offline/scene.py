@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from trimesh.units import unit_conversion
 
 from rayfix_offline.ifc import read_ifc
-from rayfix_offline.mitsuba import Placed, read_mitsuba
+from rayfix_offline.mitsuba import read_mitsuba
+from rayfix_offline.placed import Placed
 from rayfix_tables.errors import SceneError
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}

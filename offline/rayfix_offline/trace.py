@@ -6,13 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import Segments, Sequences, launch
+from rayfix_offline.launch import launch
 from rayfix_offline.materials import Reflectivity, constant_reflectivity, itu_reflectivity
 from rayfix_offline.pathprior import fill_path_prior
 from rayfix_offline.pieces import Pieces, cut_pieces
 from rayfix_offline.rays import RaySet, sample_rays
+from rayfix_offline.segments import Segments, Sequences
 from rayfix_offline.site import SiteFile, StationSection
-from rayfix_offline.surfaces import surface_sequences
+from rayfix_offline.surface_sequences import surface_sequences
 from rayfix_offline.twin import Twin
 from rayfix_tables.grid import AngularGrid
 

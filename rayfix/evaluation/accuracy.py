@@ -11,8 +11,8 @@ from rayfix.evaluation.bound import position_error_bound
 from rayfix.evaluation.forward import ForwardSolver, Paths
 from rayfix.evaluation.simulate import Noise, Rule, Timing, select_path, simulate_report, uniform_drops
 from rayfix_offline.materials import face_permittivity
+from rayfix_service.fusion.fix import Fix
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import Fix
 from rayfix_service.wire import parse_report
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.site import Station

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
 from rayfix.evaluation.accuracy import LocatedDrop
-from rayfix_service.fusion.report import Candidate, Fix
+from rayfix_service.fusion.fix import Candidate, Fix
 
 GROSS_BOUNDS, GROSS_ERROR = 5.0, 1.0
 """A fix has failed grossly when its error is above this many bounds and above this many metres."""

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rayfix.evaluation.forward_kernels import hit_triangles, trace_paths, visible
 from rayfix.evaluation.fresnel import reflection_gain_db
-from rayfix.evaluation.images import ImageTree, MirrorScene, image_tree, mirror_scene
+from rayfix.evaluation.images import image_tree, mirror_scene
+from rayfix.evaluation.mirrors import ImageTree, MirrorScene
 
 __all__ = ["ForwardSolver", "Paths", "StationSolver"]
 

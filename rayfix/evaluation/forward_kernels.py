@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from rayfix.evaluation.images import ImageTree, MirrorScene
+    from rayfix.evaluation.mirrors import ImageTree, MirrorScene
 
 SIDE_MARGIN = 1e-6
 """Least distance [m] of a path's vertex from the mirror before or after it."""

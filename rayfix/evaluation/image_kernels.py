@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rayfix.evaluation.forward_kernels import SIDE_MARGIN, grown, plane_distance
 
 if TYPE_CHECKING:
-    from rayfix.evaluation.images import MirrorScene
+    from rayfix.evaluation.mirrors import MirrorScene
 
 BEAM_MARGIN = 1e-4
 """Widening [m] of the windows while the image tree grows; more than the tolerances of a hit."""

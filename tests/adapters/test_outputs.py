@@ -17,13 +17,12 @@ from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.omlox import fix_to_omlox
 from rayfix_service.adapters.threegpp import fix_to_3gpp
 from rayfix_service.fusion.credible import CredibleRegions
+from rayfix_service.fusion.fix import Candidate, Fix, Outcome
 from rayfix_service.fusion.points import ListedPoints
-from rayfix_service.fusion.report import Candidate, Fix, Outcome
 from rayfix_service.http.examples import LOCAL_3D_EXAMPLE, OMLOX_EXAMPLE
 from rayfix_service.http.outputs import Local3dPointUncertaintyEllipsoid, OmloxLocation
 from rayfix_service.moments import utc_milliseconds
-from rayfix_service.tracking.estimate import Estimate
-from rayfix_service.tracking.tracker import TrackedPosition
+from rayfix_service.tracking.track import Estimate, TrackedPosition
 from rayfix_tables.errors import ReportError
 from rayfix_tables.normal import normal_points
 from rayfix_tables.site import SiteInfo

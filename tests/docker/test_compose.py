@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from imagetest.composition import HONOURED, WITHOUT_ENGINE, Composition
 from rayfix.cli import make_parser
-from rayfix_service.fusion.report import Status
+from rayfix_service.fusion.fix import Status
 from rayfix_service.http.keys import ApiKeys
 from rayfix_service.http.metrics import Metrics
 

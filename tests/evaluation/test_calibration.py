@@ -8,8 +8,8 @@ from scipy.stats import binomtest
 from rayfix.evaluation.accuracy import Drop, LocatedDrop
 from rayfix.evaluation.calibration import calibrate, ellipsoid_holds, wilson_interval
 from rayfix_service.fusion.credible import CredibleRegions
+from rayfix_service.fusion.fix import Candidate, Fix
 from rayfix_service.fusion.points import ListedPoints
-from rayfix_service.fusion.report import Candidate, Fix
 from rayfix_tables.normal import normal_points
 
 COV = np.array([[0.5, 0.2, 0.0], [0.2, 0.3, 0.1], [0.0, 0.1, 0.4]])

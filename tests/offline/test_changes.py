@@ -8,11 +8,11 @@ import pytest
 from numpy.typing import NDArray
 
 from rayfix_offline.changes import SMALLEST, cell_changes, ray_changes
-from rayfix_offline.launch import Segments
 from rayfix_offline.moments import CUTOFF
 from rayfix_offline.pathprior import fill_path_prior
 from rayfix_offline.pieces import cut_pieces
 from rayfix_offline.rays import RaySet, sample_rays
+from rayfix_offline.segments import Segments
 from rayfix_offline.trace import LevelRays
 from rayfix_offline.tubes import TubeFit, fit_tubes
 from rayfix_tables.angles import tangent

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import Sequences
+from rayfix_offline.segments import Sequences
 from rayfix_offline.site import parse_site
 from rayfix_offline.trace import LevelRays, trace_station
 from rayfix_offline.tubes import TubeFit, fit_tubes

@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import Segments, launch
+from rayfix_offline.launch import launch
 from rayfix_offline.materials import constant_reflectivity
 from rayfix_offline.planes import merge_coplanar
 from rayfix_offline.rays import sample_rays
+from rayfix_offline.segments import Segments
 from tests.support.shapes import quad
 
 Launch = Callable[..., Segments]

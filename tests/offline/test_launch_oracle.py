@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rayfix.evaluation.forward import ForwardSolver
-from rayfix_offline.launch import Segments
+from rayfix_offline.segments import Segments
 from rayfix_tables.angles import direction
 from tests.support.shapes import box, cut_in_three
 

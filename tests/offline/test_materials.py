@@ -16,7 +16,6 @@ from rayfix.evaluation.accuracy import solver_of
 from rayfix.evaluation.forward import ForwardSolver
 from rayfix.evaluation.fresnel import reflection_gain_db
 from rayfix_offline.build import build_table
-from rayfix_offline.launch import Segments
 from rayfix_offline.materials import (
     ITU_MATERIALS,
     LEAST_POWER,
@@ -29,6 +28,7 @@ from rayfix_offline.materials import (
     itu_name,
     itu_reflectivity,
 )
+from rayfix_offline.segments import Segments
 from rayfix_offline.site import read_site
 from rayfix_offline.trace import reflectivity_of
 from rayfix_offline.twin import prepare_twin, refuse_errors

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import Segments, Sequences
 from rayfix_offline.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR, blur, gather_groups, gathered_arrays, new_rows
 from rayfix_offline.pathprior import PathPrior
 from rayfix_offline.pieces import Pieces, cut_pieces
 from rayfix_offline.rays import RaySet, sample_rays
+from rayfix_offline.segments import Segments, Sequences
 from rayfix_tables.angles import direction, tangent
 from tests.support.rays import no_reflections
 

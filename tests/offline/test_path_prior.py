@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from rayfix.evaluation.forward import ForwardSolver
-from rayfix_offline.launch import Segments
 from rayfix_offline.pathprior import PathPrior, fill_path_prior, reflection_factors
 from rayfix_offline.rays import RaySet, sample_rays
+from rayfix_offline.segments import Segments
 from rayfix_tables.freespace import FreeSpace
 from tests.support.shapes import box
 

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_offline.launch import Segments
 from rayfix_offline.pathprior import PathPrior, fill_path_prior
 from rayfix_offline.pieces import FIRST_NODE, Pieces, cut_pieces
 from rayfix_offline.rays import RaySet, sample_rays
+from rayfix_offline.segments import Segments
 from rayfix_tables.freespace import FreeSpace
 from tests.support.rays import no_reflections
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rayfix_service.fusion.fix import Fix
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import (
     HEAVY_TAILED,
     Angle,
     ErrorModel,
-    Fix,
     Height,
     LogRange,
     Measurement,

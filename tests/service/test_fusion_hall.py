@@ -15,22 +15,13 @@ from rayfix_service.fusion import reference
 from rayfix_service.fusion.beam import multiply
 from rayfix_service.fusion.factor_kernels import TIME_OUTLIER
 from rayfix_service.fusion.factors import Factor, make_factor
+from rayfix_service.fusion.fix import Candidate, Fix
 from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.natural import unpack
 from rayfix_service.fusion.observations import sort_report
 from rayfix_service.fusion.prior import Prior, even_prior
-from rayfix_service.fusion.report import (
-    Angle,
-    Candidate,
-    Fix,
-    Frame,
-    Measurement,
-    Range,
-    Report,
-    TimeDifference,
-    TimeOfArrival,
-)
+from rayfix_service.fusion.report import Angle, Frame, Measurement, Range, Report, TimeDifference, TimeOfArrival
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.wire import parse_report
 from rayfix_tables.angles import angles_of, direction, local_to_scene

@@ -13,11 +13,11 @@ from scipy.stats import norm
 
 from rayfix_service.fusion import beam_kernels, factor_kernels, modes, natural, reference
 from rayfix_service.fusion.cutting import cut_to_free_space
+from rayfix_service.fusion.directions import Direction
 from rayfix_service.fusion.factor_kernels import ALL_GOOD
 from rayfix_service.fusion.factors import make_factor
 from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.likelihood import Term, gaussian_terms, log_normal_terms, spreads
-from rayfix_service.fusion.lookup import Direction
 from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.report import GAUSSIAN, ErrorModel

@@ -6,7 +6,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.lookup import NO_DIRECTION, SUM_RATIO, Direction, Lookup, look_up
+from rayfix_service.fusion.directions import NO_DIRECTION, Direction
+from rayfix_service.fusion.lookup import SUM_RATIO, Lookup, look_up
 from rayfix_tables.angles import angles_of, local_to_scene, wrap
 from rayfix_tables.angles import direction as direction_of
 from rayfix_tables.grid import AngularGrid

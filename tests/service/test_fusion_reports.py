@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.directions import in_field_of_view, to_scene, without_bias
-from rayfix_service.fusion.lookup import NO_DIRECTION, Direction
+from rayfix_service.fusion.directions import NO_DIRECTION, Direction, in_field_of_view, to_scene, without_bias
 from rayfix_service.fusion.observations import SortedReport, sort_report
 from rayfix_service.fusion.report import (
     HEAVY_TAILED,

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rayfix_service.fusion.fix import Fix
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import (
     GAUSSIAN,
     HEAVY_TAILED,
     Angle,
     ErrorModel,
-    Fix,
     Height,
     LogRange,
     Measurement,

@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rayfix_service.fusion.heard import HeardStation
+from rayfix_service.fusion.directions import NO_DIRECTION, Direction
+from rayfix_service.fusion.fix import Fix
+from rayfix_service.fusion.heard import HeardStation, is_direct
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.lookup import NO_DIRECTION, Direction, look_up
-from rayfix_service.fusion.report import Angle, Fix, Measurement, Range, Report
-from rayfix_service.fusion.sight import Sight, is_direct
+from rayfix_service.fusion.lookup import look_up
+from rayfix_service.fusion.report import Angle, Measurement, Range, Report
+from rayfix_service.fusion.sight import Sight
 from rayfix_tables.table import Table
 from tests.support.hand_reports import EXACT, angle_of
 from tests.support.hand_tables import POSITIONS, UE, MakeTable, Tube, line_of_sight

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from rayfix_service.fusion.fix import Fix, Outcome
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import Fix, Outcome
 from rayfix_service.http.examples import BATCH_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.http.logs import JsonFormatter, log_config
 from rayfix_service.http.metrics import Metrics

@@ -12,15 +12,13 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from rayfix_service.fusion.credible import CredibleRegions
+from rayfix_service.fusion.fix import Candidate, Fix, Outcome
 from rayfix_service.fusion.points import ListedPoints
 from rayfix_service.fusion.report import (
     Angle,
-    Candidate,
     ErrorModel,
-    Fix,
     Height,
     LogRange,
-    Outcome,
     Range,
     Report,
     TimeDifference,

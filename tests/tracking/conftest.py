@@ -15,9 +15,9 @@ import pytest
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.beam import Hypotheses
+from rayfix_service.fusion.fix import Fix
 from rayfix_service.fusion.locator import Fused
 from rayfix_service.fusion.prior import Prior, even_prior
-from rayfix_service.fusion.report import Fix
 from rayfix_service.tracking.likelihood import Likelihood, likelihood_of
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Scene

@@ -12,7 +12,8 @@ from rayfix_service.fusion.beam import Hypotheses
 from rayfix_service.fusion.locator import Fused
 from rayfix_service.tracking.estimate import largest_group
 from rayfix_service.tracking.settings import TrackingSettings
-from rayfix_service.tracking.tracker import TrackedPosition, Tracker
+from rayfix_service.tracking.track import TrackedPosition
+from rayfix_service.tracking.tracker import Tracker
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Scene
 

@@ -9,7 +9,7 @@ from rayfix.evaluation.paper.algorithms import PaperSettings, algorithm_1, algor
 from rayfix.evaluation.paper.mixtures import Mixture, arg_max, multiply
 from rayfix.evaluation.paper.points import Launcher, RayPoints, draw_directions, points_on_rays
 from rayfix.evaluation.paper.reports import sort_for_paper
-from rayfix_service.fusion.lookup import NO_DIRECTION, Direction
+from rayfix_service.fusion.directions import NO_DIRECTION, Direction
 from rayfix_service.fusion.report import Report
 from rayfix_tables.site import SiteInfo
 from rayfix_tables.table import Table

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.engine import EmbreeEngine, RayEngine
-from rayfix_offline.launch import Segments, launch
+from rayfix_offline.launch import launch
 from rayfix_offline.materials import Reflectivity, constant_reflectivity
 from rayfix_offline.planes import Planes, merge_coplanar
-from rayfix_service.fusion.lookup import Direction
+from rayfix_offline.segments import Segments
+from rayfix_service.fusion.directions import Direction
 from rayfix_tables.angles import direction
 from rayfix_tables.table import Table
 

@@ -7,8 +7,7 @@ from typing import NoReturn
 import numpy as np
 
 from rayfix.evaluation.paper.selection import RelativeLength
-from rayfix_service.fusion.directions import to_scene, without_bias
-from rayfix_service.fusion.lookup import Direction
+from rayfix_service.fusion.directions import Direction, to_scene, without_bias
 from rayfix_service.fusion.report import GAUSSIAN, Angle, LogRange, Range, Report, TimeDifference
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station

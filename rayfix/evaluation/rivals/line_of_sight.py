@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from rayfix.evaluation.paper.reports import PaperReport
 from rayfix.evaluation.paper.selection import RelativeLength
 from rayfix.evaluation.rivals.reports import sort_for_rivals, station_positions
-from rayfix_service.fusion.lookup import Direction
+from rayfix_service.fusion.directions import Direction
 from rayfix_service.fusion.report import Height, Report
 from rayfix_tables.angles import angles_of, wrap
 from rayfix_tables.site import SiteInfo

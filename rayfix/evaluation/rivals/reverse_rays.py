@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rayfix.evaluation.paper.points import Launcher
 from rayfix.evaluation.rivals.reports import sort_for_rivals, station_positions
-from rayfix_service.fusion.lookup import Direction
+from rayfix_service.fusion.directions import Direction
 from rayfix_service.fusion.report import Report
 from rayfix_tables.angles import direction
 from rayfix_tables.site import SiteInfo

@@ -14,8 +14,8 @@ from rayfix.evaluation.paper.selection import select_by_length
 from rayfix.evaluation.rivals.planar import plane_crossings
 from rayfix.evaluation.studies.bench import Bench
 from rayfix.evaluation.studies.cases import Case, World, simulate_case
+from rayfix_service.fusion.directions import Direction
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.lookup import Direction
 from rayfix_service.wire import parse_report
 
 __all__ = ["draw_pictures"]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rayfix.evaluation.paper.mixtures import Mixture, arg_max, condition_on_last, multiply
 from rayfix.evaluation.paper.reports import sort_for_paper
-from rayfix_service.fusion.lookup import Direction
+from rayfix_service.fusion.directions import Direction
 from rayfix_service.fusion.report import Report
 from rayfix_tables.errors import ReportError
 from rayfix_tables.level import Level

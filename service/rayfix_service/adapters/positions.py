@@ -1,8 +1,8 @@
 """What formats that know one position alone take from a fix, or from the track that it went into."""
 
 from rayfix_service.fusion.credible import CredibleRegions
-from rayfix_service.fusion.report import Candidate, Fix
-from rayfix_service.tracking.tracker import TrackedPosition
+from rayfix_service.fusion.fix import Candidate, Fix
+from rayfix_service.tracking.track import TrackedPosition
 from rayfix_tables.errors import ReportError
 
 

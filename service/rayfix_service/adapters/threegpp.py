@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from rayfix_service.adapters.positions import best_candidate
-from rayfix_service.fusion.report import Fix
-from rayfix_service.tracking.tracker import TrackedPosition
+from rayfix_service.fusion.fix import Fix
+from rayfix_service.tracking.track import TrackedPosition
 from rayfix_tables.site import SiteInfo
 
 

@@ -1,14 +1,37 @@
 """Angles as measured, turned into directions of the scene."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.lookup import Direction
 from rayfix_service.fusion.report import Angle
 from rayfix_tables.angles import angles_of, direction, local_to_scene
 from rayfix_tables.site import NO_BIAS, Station
+
+
+@dataclass(frozen=True, kw_only=True)
+class Direction:
+    """A measured direction in the scene frame.
+
+    Attributes
+    ----------
+    azimuth, zenith : float or None, rad
+        None when not measured.
+    cov : ndarray of shape (2, 2), rad2
+        Covariance of azimuth and zenith; infinite on the diagonal for what was not measured.
+    tilt : ndarray of shape (3, 3), optional
+        Of an azimuth alone in a frame whose z axis is not the scene's: takes that frame's vectors into the scene's.
+    """
+
+    azimuth: float | None
+    zenith: float | None
+    cov: NDArray[np.float64]
+    tilt: NDArray[np.float64] | None = None
+
+
+NO_DIRECTION = Direction(azimuth=None, zenith=None, cov=np.diag([np.inf, np.inf]))
+"""What a station without an angle has measured."""
 
 
 def without_bias(angle: Angle, station: Station) -> Angle:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.clocks import ClockReading
+from rayfix_service.fusion.directions import Direction
 from rayfix_service.fusion.factor_kernels import ALL_GOOD, PART, READING, TIME_OUTLIER, make_alternatives
 from rayfix_service.fusion.heard import HeardStation, join
 from rayfix_service.fusion.likelihood import Term, product, total_variance
-from rayfix_service.fusion.lookup import Direction
 from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.settings import FusionSettings

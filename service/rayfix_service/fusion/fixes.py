@@ -6,10 +6,11 @@ import numpy as np
 
 from rayfix_service.fusion.beam import Hypotheses
 from rayfix_service.fusion.credible import CredibleRegions
+from rayfix_service.fusion.fix import Candidate, Fix, Outcome, Status
 from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.outliers import culprits
 from rayfix_service.fusion.prior import Prior
-from rayfix_service.fusion.report import Candidate, Fix, Outcome, Report, Status
+from rayfix_service.fusion.report import Report
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.summary import sum_up
 from rayfix_tables.table import Table

@@ -9,9 +9,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.lookup import NO_DIRECTION, Direction, Lookup, look_up
+from rayfix_service.fusion.directions import NO_DIRECTION, Direction
+from rayfix_service.fusion.lookup import Lookup, look_up
 from rayfix_service.fusion.merging import merge_gaussians
-from rayfix_service.fusion.sight import Sight, is_direct
+from rayfix_service.fusion.sight import Sight
 from rayfix_tables.conditioning import condition_on_angle
 from rayfix_tables.table import StationPart
 
@@ -158,3 +159,14 @@ def _condition_cells(
                 log_evidence[place] += log_balance[k]
                 place += 1
     return log_evidence, mean, cov
+
+
+def is_direct(lookup: Lookup) -> NDArray[np.bool_]:
+    """Tell which components of the cells of a lookup, cell after cell, are of paths without a reflection.
+
+    A component of several paths counts as the one that carries most of it.
+    """
+    offsets = lookup.level.cell_offsets
+    begins, counts = offsets[lookup.cells], offsets[lookup.cells + 1] - offsets[lookup.cells]
+    places = np.repeat(begins - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
+    return np.asarray(lookup.level.mixture.num_reflections[places] == 0)

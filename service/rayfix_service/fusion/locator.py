@@ -7,13 +7,14 @@ import numpy as np
 from rayfix_service.fusion.beam import Hypotheses, multiply
 from rayfix_service.fusion.credible import CredibleRegions
 from rayfix_service.fusion.factors import Factor, make_factor
+from rayfix_service.fusion.fix import Fix
 from rayfix_service.fusion.fixes import Product, make_fix
 from rayfix_service.fusion.heard import HeardStation
 from rayfix_service.fusion.observations import Observation, SortedReport, sort_report
 from rayfix_service.fusion.points import DrawnPoints
 from rayfix_service.fusion.posterior import Posterior, make_posterior
 from rayfix_service.fusion.prior import Prior, even_prior, height_prior
-from rayfix_service.fusion.report import Angle, Fix, Range, Report
+from rayfix_service.fusion.report import Angle, Range, Report
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.table import Table
 

@@ -15,12 +15,12 @@ radian when one was, and 1 when none was.
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_service.fusion.directions import Direction
 from rayfix_service.fusion.unity import sum_of_ellipse, sum_of_meridian
 from rayfix_tables.angles import wrap
 from rayfix_tables.level import WINDOW_RATIO, Level
@@ -46,30 +46,6 @@ SUM_RATIO = 1.6
 A cell of the next window is merged for noise of its own size: for hardly more noise than this window serves, its
 components are too wide.
 """
-
-
-@dataclass(frozen=True, kw_only=True)
-class Direction:
-    """A measured direction in the scene frame.
-
-    Attributes
-    ----------
-    azimuth, zenith : float or None, rad
-        None when not measured.
-    cov : ndarray of shape (2, 2), rad2
-        Covariance of azimuth and zenith; infinite on the diagonal for what was not measured.
-    tilt : ndarray of shape (3, 3), optional
-        Of an azimuth alone in a frame whose z axis is not the scene's: takes that frame's vectors into the scene's.
-    """
-
-    azimuth: float | None
-    zenith: float | None
-    cov: NDArray[np.float64]
-    tilt: NDArray[np.float64] | None = None
-
-
-NO_DIRECTION = Direction(azimuth=None, zenith=None, cov=np.diag([np.inf, np.inf]))
-"""What a station without an angle has measured."""
 
 
 class Lookup(NamedTuple):

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from rayfix_service.fusion.clocks import Arrival, ClockReading, Difference, clocks_of_differences, read_clocks
-from rayfix_service.fusion.directions import in_field_of_view, to_scene, without_bias
+from rayfix_service.fusion.directions import NO_DIRECTION, Direction, in_field_of_view, to_scene, without_bias
 from rayfix_service.fusion.likelihood import ONE_GAUSSIAN, Spread, Term, gaussian_terms, log_normal_terms, spreads
-from rayfix_service.fusion.lookup import NO_DIRECTION, Direction
 from rayfix_service.fusion.report import (
     Angle,
     LogRange,

@@ -12,10 +12,6 @@ import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from rayfix_service.fusion.lookup import Lookup
 from rayfix_service.fusion.report import Angle, Measurement, Range, TimeOfArrival
 
 _JUDGED = (Angle, Range, TimeOfArrival)
@@ -42,14 +38,3 @@ def los_probability(measurements: Iterable[Measurement]) -> float | None:
     """
     said = [m.los_probability for m in measurements if isinstance(m, _JUDGED) and m.los_probability is not None]
     return sum(said) / len(said) if said else None
-
-
-def is_direct(lookup: Lookup) -> NDArray[np.bool_]:
-    """Tell which components of the cells of a lookup, cell after cell, are of paths without a reflection.
-
-    A component of several paths counts as the one that carries most of it.
-    """
-    offsets = lookup.level.cell_offsets
-    begins, counts = offsets[lookup.cells], offsets[lookup.cells + 1] - offsets[lookup.cells]
-    places = np.repeat(begins - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
-    return np.asarray(lookup.level.mixture.num_reflections[places] == 0)

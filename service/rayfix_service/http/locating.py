@@ -14,15 +14,16 @@ from starlette.requests import HTTPConnection
 from rayfix_service.adapters.adapted import Adapted, error_in_message
 from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.omlox_hub import OmloxHub
+from rayfix_service.fusion.fix import Fix
 from rayfix_service.fusion.locator import Fused
-from rayfix_service.fusion.report import Fix, Report
+from rayfix_service.fusion.report import Report
 from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.metrics import Metrics
 from rayfix_service.http.problems import ProblemError, internal_problem, problem_document, report_problem
 from rayfix_service.http.slow_fixes import SlowFixes, is_slow
 from rayfix_service.http.tables import ServedTable
 from rayfix_service.http.wanted import Wanted
-from rayfix_service.tracking.tracker import TrackedPosition
+from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report, report_to_document
 from rayfix_tables.errors import ReportError
 

@@ -9,8 +9,8 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 
 from rayfix_service.adapters.omlox_hub import HubOutcome
-from rayfix_service.fusion.report import Fix, Status
-from rayfix_service.tracking.tracker import TrackState
+from rayfix_service.fusion.fix import Fix, Status
+from rayfix_service.tracking.track import TrackState
 from rayfix_tables.table import Table
 
 MULTIPROCESS_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"

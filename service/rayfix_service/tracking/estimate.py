@@ -1,12 +1,12 @@
 """What is told of particles: the place where most of them are."""
 
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.tracking.particles import Particles
+from rayfix_service.tracking.track import Estimate
 
 _REACH = 0.5
 """Particles in neighbouring cells of this side, m, are of one group."""
@@ -14,27 +14,6 @@ _REACH = 0.5
 _NEIGHBOURS = [step for step in product((-1, 0, 1), repeat=3) if any(step)]
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """Where a target is and how it moves.
-
-    Attributes
-    ----------
-    probability : float
-        That it is in this place rather than in another one.
-    position : ndarray of shape (3,), m
-    covariance : ndarray of shape (3, 3), m2
-    velocity : ndarray of shape (3,), m / s
-    velocity_covariance : ndarray of shape (3, 3), m2 / s2
-    """
-
-    probability: float
-    position: Array
-    covariance: Array
-    velocity: Array
-    velocity_covariance: Array
 
 
 def estimate(particles: Particles) -> Estimate:

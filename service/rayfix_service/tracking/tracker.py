@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import Lock
 from time import monotonic
-from typing import Literal
 
 import numpy as np
 
@@ -15,39 +14,14 @@ from rayfix_service.fusion.credible import CredibleRegions
 from rayfix_service.fusion.locator import Fused
 from rayfix_service.fusion.points import ListedPoints
 from rayfix_service.moments import utc_moment
-from rayfix_service.tracking.estimate import Estimate, estimate
+from rayfix_service.tracking.estimate import estimate
 from rayfix_service.tracking.likelihood import likelihood_of
 from rayfix_service.tracking.particles import Particles, birth, mixed, predict, update
 from rayfix_service.tracking.settings import TrackingSettings
+from rayfix_service.tracking.track import TrackedPosition, TrackState
 from rayfix_service.tracking.walls import walls_of
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Scene
-
-TrackState = Literal["started", "updated", "restarted", "predicted", "late"]
-"""What a report did to its target's track; docs/tracking.md defines each."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrackedPosition:
-    """A target's track after a report.
-
-    Attributes
-    ----------
-    state : {"started", "updated", "restarted", "predicted", "late"}
-    timestamp : str
-        Time that the track is of: that of the last report that it was updated or predicted with.
-    num_reports : int
-        Reports since the track's start that said something of the position.
-    estimate : Estimate
-    regions : CredibleRegions
-        Regions around the estimate's position that hold the target with any probability.
-    """
-
-    state: TrackState
-    timestamp: str
-    num_reports: int
-    estimate: Estimate
-    regions: CredibleRegions
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,7 +9,6 @@ from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse
 
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import Report
 from rayfix_service.http.dependencies import ReportBody, TableDep
 from rayfix_service.http.examples import REPORT_EXAMPLES
 from rayfix_service.http.outputs import POSITION_PROBLEMS, request_body
@@ -29,11 +28,10 @@ from rayfix_service.web.documents import (
     ViewerSettings,
     parse_simulation,
     path_document,
-    posterior_document,
 )
 from rayfix_service.web.simulation import simulate
+from rayfix_service.web.viewer_settings import picture_posterior, viewer_settings
 from rayfix_service.wire import ReportDocument, fix_to_document, parse_report
-from rayfix_tables.table import Table
 
 router = APIRouter(prefix="/v1", tags=["viewer"])
 
@@ -43,11 +41,6 @@ SIMULATION_EXAMPLES = {
         "value": {"position": [5.32, 14.2, 0.67], "kinds": ["aoa", "pt"], "angle_stdev_deg": 1.0, "seed": 1},
     }
 }
-
-_SAMPLES = 1500
-
-_MAX_REFLECTIONS = 3
-"""Of tables whose site does not say."""
 
 
 @router.get(
@@ -90,20 +83,6 @@ async def post_posterior(request: Request, served: TableDep, body: ReportBody) -
     """Give the Gaussians of the posterior and positions drawn from it, for pictures."""
     slow_fixes: SlowFixes = request.app.state.slow_fixes
     return JSONResponse(await slow_fixes.locate(partial(picture_posterior, served.locator), parse_report(body)))
-
-
-def viewer_settings(table: Table, *, simulation: bool) -> ViewerSettings:
-    """Gather what the viewer must know beforehand."""
-    propagation = table.site.document.get("propagation", {})
-    return ViewerSettings(
-        simulation=simulation, max_reflections=int(propagation.get("max_reflections", _MAX_REFLECTIONS))
-    )
-
-
-def picture_posterior(locator: Locator, report: Report) -> dict[str, Any]:
-    """Build what :class:`PosteriorDocument` describes; the same report gives the same samples."""
-    posterior = locator.posterior(report)
-    return posterior_document(posterior, posterior.sample(_SAMPLES, np.random.default_rng(0)))
 
 
 def _simulate_and_locate(locator: Locator, wanted: SimulationRequest) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from rayfix_service.tracking.tracker import TrackedPosition, TrackState
+from rayfix_service.tracking.track import TrackedPosition, TrackState
 from rayfix_service.wire.points import Matrix, Point, point
 
 

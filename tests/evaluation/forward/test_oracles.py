@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rayfix.evaluation.forward import ForwardSolver, Paths, StationSolver
-from rayfix.evaluation.images import ImageTree
+from rayfix.evaluation.mirrors import ImageTree
 from rayfix.example.hall import HALL_SIZE, hall_stations
 from tests.support.forward_paths import assert_same_paths, bounces, solver_of
 from tests.support.shapes import box, quad

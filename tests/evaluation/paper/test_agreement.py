@@ -14,9 +14,9 @@ from rayfix.evaluation.paper.mixtures import Mixture, multiply
 from rayfix.evaluation.paper.points import Launcher, RayPoints, draw_directions, points_on_rays
 from rayfix.evaluation.paper.selection import RelativeLength, select_by_length
 from rayfix_service.fusion import beam
+from rayfix_service.fusion.directions import NO_DIRECTION, Direction
 from rayfix_service.fusion.factors import make_factor
 from rayfix_service.fusion.heard import HeardStation
-from rayfix_service.fusion.lookup import NO_DIRECTION, Direction
 from rayfix_service.fusion.observations import sort_report
 from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.report import Angle, Measurement, Range, Report, TimeDifference

@@ -9,7 +9,7 @@ from rayfix.evaluation.paper.selection import RelativeLength, select_by_length, 
 from rayfix_offline.engine import EmbreeEngine
 from rayfix_offline.materials import constant_reflectivity
 from rayfix_offline.planes import merge_coplanar
-from rayfix_service.fusion.lookup import NO_DIRECTION, Direction
+from rayfix_service.fusion.directions import NO_DIRECTION, Direction
 from rayfix_tables.angles import angles_of
 
 STATION = np.array([1.0, 2.0, 1.5])

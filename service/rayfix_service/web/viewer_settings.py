@@ -1,0 +1,30 @@
+"""What the viewer and the page of a report show, whether a service answers or a file."""
+
+from typing import Any
+
+import numpy as np
+
+from rayfix_service.fusion.locator import Locator
+from rayfix_service.fusion.report import Report
+from rayfix_service.web.documents import ViewerSettings, posterior_document
+from rayfix_tables.table import Table
+
+_SAMPLES = 1500
+
+
+_MAX_REFLECTIONS = 3
+"""Of tables whose site does not say."""
+
+
+def viewer_settings(table: Table, *, simulation: bool) -> ViewerSettings:
+    """Gather what the viewer must know beforehand."""
+    propagation = table.site.document.get("propagation", {})
+    return ViewerSettings(
+        simulation=simulation, max_reflections=int(propagation.get("max_reflections", _MAX_REFLECTIONS))
+    )
+
+
+def picture_posterior(locator: Locator, report: Report) -> dict[str, Any]:
+    """Build what :class:`PosteriorDocument` describes; the same report gives the same samples."""
+    posterior = locator.posterior(report)
+    return posterior_document(posterior, posterior.sample(_SAMPLES, np.random.default_rng(0)))

@@ -1,0 +1,99 @@
+"""A table and its stations as JSON."""
+
+import math
+
+from pydantic import BaseModel, Field
+
+from rayfix_service.wire.points import Point
+from rayfix_tables.level import Level
+from rayfix_tables.site import Station
+from rayfix_tables.table import Table
+
+
+class SiteSummary(BaseModel):
+    """The site that the table was built for."""
+
+    name: str
+    north_deg: float = Field(description="azimuth of geographic north in the scene frame")
+    max_path_length_m: float = Field(description="longest unfolded path in the table")
+
+
+class TableSummary(BaseModel):
+    """A table that answers."""
+
+    name: str = Field(description="name of its file without the suffix; for the query parameter table")
+    table_id: str = Field(description="SHA-256 of the table's content")
+    format_version: int
+    software_version: str = Field(description="version of rayfix that built the table")
+    site: SiteSummary
+    num_stations: int
+    num_components: int = Field(description="Gaussian components over all stations and levels")
+
+
+class LevelSummary(BaseModel):
+    """All cells of a station at one angular window."""
+
+    window_deg: float
+    num_cells: int
+    num_components: int
+
+
+class OrientationSummary(BaseModel):
+    """Orientation of a station, as in 3GPP TR 38.901."""
+
+    bearing_deg: float
+    downtilt_deg: float
+    slant_deg: float
+
+
+class StationSummary(BaseModel):
+    """A station and its part of the table."""
+
+    id: str
+    position: Point
+    orientation: OrientationSummary
+    field_of_view_deg: float = Field(description="full opening angle of the cone in which it measures")
+    levels: list[LevelSummary] = Field(description="finest first")
+
+
+def table_summary(name: str, table: Table) -> TableSummary:
+    """Describe a table."""
+    stations = table.site.stations
+    return TableSummary(
+        name=name,
+        table_id=table.table_id,
+        format_version=table.format_version,
+        software_version=table.software_version,
+        site=SiteSummary(
+            name=table.site.name,
+            north_deg=_degrees(table.site.north),
+            max_path_length_m=table.site.max_path_length,
+        ),
+        num_stations=len(stations),
+        num_components=sum(level.num_components for s in stations for level in table.levels(s.id)),
+    )
+
+
+def station_summary(station: Station, levels: tuple[Level, ...]) -> StationSummary:
+    """Describe a station and its levels."""
+    x, y, z = station.position
+    bearing, downtilt, slant = (_degrees(angle) for angle in station.orientation)
+    return StationSummary(
+        id=station.id,
+        position=Point(x=x, y=y, z=z),
+        orientation=OrientationSummary(bearing_deg=bearing, downtilt_deg=downtilt, slant_deg=slant),
+        field_of_view_deg=_degrees(station.field_of_view),
+        levels=[
+            LevelSummary(
+                window_deg=_degrees(level.window),
+                num_cells=level.num_cells,
+                num_components=level.num_components,
+            )
+            for level in levels
+        ],
+    )
+
+
+def _degrees(radians: float) -> float:
+    """Convert to degrees, without the last digits that the way through radians cost."""
+    return round(math.degrees(radians), 9)
