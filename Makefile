@@ -42,6 +42,7 @@ browser: $(VENV)/.done viewer
 lint: $(VENV)/.done
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+	$(BIN)/lint-imports --no-cache
 
 types: $(VENV)/.done
 	$(BIN)/mypy
@@ -61,7 +62,7 @@ accuracy: $(VENV)/.done
 	$(BIN)/python benchmarks/accuracy.py
 
 openapi: $(VENV)/.done
-	$(BIN)/python -m rayfix_service.http.openapi > docs/openapi.json
+	$(BIN)/python -m rayfix_service.server.openapi > docs/openapi.json
 
 clean:
 	rm -rf $(VENV) dist demo browser-artefacts $(dir $(VIEWER)) $(FRONTEND)/node_modules .pytest_cache .mypy_cache .ruff_cache

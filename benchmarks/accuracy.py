@@ -7,9 +7,9 @@ from collections import Counter
 
 import numpy as np
 
-from rayfix.evaluation.accuracy import drop_uniformly, locate_drops
-from rayfix.evaluation.simulate import Noise, Timing
-from rayfix.evaluation.tables import open_or_build, table_parser
+from example_table import open_or_build, table_parser
+from rayfix_evaluation.drops.accuracy import drop_uniformly, locate_drops
+from rayfix_evaluation.drops.simulate import Noise, Timing
 from rayfix_service.fusion.locator import Locator
 from rayfix_tables.table import Table
 

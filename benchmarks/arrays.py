@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rayfix.evaluation.accuracy import drop_uniformly
-from rayfix.evaluation.arrays.picture import draw_angle_errors
-from rayfix.evaluation.arrays.planar import PlanarArray, Signal
-from rayfix.evaluation.arrays.study import ArrayStudy, angle_errors, statistics_rows, study_statistics
-from rayfix.evaluation.tables import open_or_build, table_parser
+from example_table import open_or_build, table_parser
+from rayfix_evaluation.arrays.picture import draw_angle_errors
+from rayfix_evaluation.arrays.planar import PlanarArray, Signal
+from rayfix_evaluation.arrays.study import ArrayStudy, angle_errors, statistics_rows, study_statistics
+from rayfix_evaluation.drops.accuracy import drop_uniformly
 
 STUDIES = {
     "4 x 4 antennas, 20 dB": ArrayStudy(

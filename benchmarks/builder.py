@@ -19,24 +19,24 @@ from pathlib import Path
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from held_out import COMPONENT_BYTES
 from numpy.typing import NDArray
 
+from held_out import COMPONENT_BYTES
 from rayfix.example.files import write_example
-from rayfix_offline import trace
-from rayfix_offline.cells import assemble_level, fit_cells, widen_cells
-from rayfix_offline.em import ExpectationMaximisation, fit_em
-from rayfix_offline.engine import RayEngine
-from rayfix_offline.launch import launch
-from rayfix_offline.moments import gather_groups, gathered_arrays, new_rows
-from rayfix_offline.pathprior import fill_path_prior
-from rayfix_offline.pieces import cut_pieces
-from rayfix_offline.rays import RaySet, sample_rays
-from rayfix_offline.segments import Segments
+from rayfix_offline.fit.cells import assemble_level, fit_cells, widen_cells
+from rayfix_offline.fit.em import ExpectationMaximisation, fit_em
+from rayfix_offline.fit.moments import gather_groups, gathered_arrays, new_rows
+from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.rays import trace
+from rayfix_offline.rays.launch import launch
+from rayfix_offline.rays.pathprior import fill_path_prior
+from rayfix_offline.rays.pieces import cut_pieces
+from rayfix_offline.rays.rays import RaySet, sample_rays
+from rayfix_offline.rays.segments import Segments
+from rayfix_offline.rays.trace import LevelRays, StationTrace, level_grid, reflectivity_of, trace_station
+from rayfix_offline.scene.engine import RayEngine
 from rayfix_offline.site import SiteFile, read_site
-from rayfix_offline.trace import LevelRays, StationTrace, level_grid, reflectivity_of, trace_station
-from rayfix_offline.tubes import TubeFit, fit_tubes
-from rayfix_offline.twin import Twin, prepare_twin
+from rayfix_offline.twin.twin import Twin, prepare_twin
 
 RUNS = 5
 

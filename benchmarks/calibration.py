@@ -9,10 +9,10 @@ from typing import get_args
 
 import numpy as np
 
-from rayfix.evaluation.accuracy import Drop, drop_uniformly, locate_drop
-from rayfix.evaluation.calibration import calibrate, wilson_interval
-from rayfix.evaluation.simulate import Noise, Rule, Timing
-from rayfix.evaluation.tables import open_or_build, table_parser
+from example_table import open_or_build, table_parser
+from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly, locate_drop
+from rayfix_evaluation.drops.calibration import calibrate, wilson_interval
+from rayfix_evaluation.drops.simulate import Noise, Rule, Timing
 from rayfix_service.fusion.locator import Locator
 
 TIMINGS: tuple[Timing, ...] = ("none", "pt", "tdoa")

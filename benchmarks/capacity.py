@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 import psutil
 
-from rayfix.evaluation.accuracy import Drop, drop_uniformly
-from rayfix.evaluation.simulate import Noise, Timing, simulate_report
-from rayfix.evaluation.tables import open_or_build, table_parser
+from example_table import open_or_build, table_parser
+from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly
+from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.wire import parse_report
 

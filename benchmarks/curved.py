@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from held_out import log_densities
 from numpy.typing import NDArray
 
-from rayfix_offline.em import sample_points
-from rayfix_offline.joining import join_groups
-from rayfix_offline.moments import gather_groups, new_rows
+from held_out import log_densities
+from rayfix_offline.fit.em import sample_points
+from rayfix_offline.fit.join_surfaces import join_groups
+from rayfix_offline.fit.moments import gather_groups, new_rows
+from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.rays.trace import LevelRays, trace_station
 from rayfix_offline.site import SiteFile, parse_site
-from rayfix_offline.trace import LevelRays, trace_station
-from rayfix_offline.tubes import TubeFit, fit_tubes
-from rayfix_offline.twin import Twin, prepare_twin
+from rayfix_offline.twin.twin import Twin, prepare_twin
 from rayfix_tables.angles import wrap
 
 STATION = (0.3, 0.4, 2.6)

@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from rayfix.evaluation.accuracy import Drop, drop_uniformly
-from rayfix.evaluation.simulate import Noise, Timing, simulate_report
-from rayfix.evaluation.tables import open_or_build, table_parser
-from rayfix_service.fusion import reference
-from rayfix_service.fusion.beam import multiply
-from rayfix_service.fusion.factors import Factor, make_factor
-from rayfix_service.fusion.heard import HeardStation
-from rayfix_service.fusion.natural import unpack
-from rayfix_service.fusion.observations import sort_report
-from rayfix_service.fusion.prior import Prior, even_prior
+from example_table import open_or_build, table_parser
+from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly
+from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
+from rayfix_service.fusion.measurements.observations import sort_report
+from rayfix_service.fusion.product.beam import multiply
+from rayfix_service.fusion.product.factors import Factor, make_factor
+from rayfix_service.fusion.product.information_form import unpack
+from rayfix_service.fusion.product.prior import Prior, even_prior
+from rayfix_service.fusion.product.station_mixture import HeardStation
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.wire import parse_report
+from tests.support import kernel_twins
 
 Array = NDArray[np.float64]
 Measurements = list[dict[str, Any]]
@@ -143,7 +143,7 @@ def likeliest(factor: Factor, place: Array, most: int, prior: Prior, log_range: 
     information, eta, log_scale = unpack(factor.columns)
     near = np.zeros_like(information[0])
     near[[0, 1, 2], [0, 1, 2]] = NEAR**-2
-    score = reference.log_integral(
+    score = kernel_twins.log_integral(
         information + near, eta + near[:, :3] @ place, log_scale, prior.log_volume, log_range
     )
     keep = np.append(np.argsort(-score[:-1], kind="stable")[:most], len(factor) - 1)
@@ -162,7 +162,7 @@ def exhaustive(factors: list[Factor], num_clocks: int, prior: Prior, log_range: 
         log_scale = (log_scale[:, None] + other_scale).ravel()
     placed = information[:, 0, 0] > 0.0
     information, eta, log_scale = information[placed], eta[placed], log_scale[placed]
-    log_weight = reference.log_integral(information, eta, log_scale, prior.log_volume, log_range)
+    log_weight = kernel_twins.log_integral(information, eta, log_scale, prior.log_volume, log_range)
     unknown = np.diagonal(information, axis1=1, axis2=2) <= 0.0
     cov = np.asarray(np.linalg.inv(information + unknown[:, None] * np.eye(size)), np.float64)
     return log_weight, np.einsum("hij,hj->hi", cov, eta)[:, :3], cov[:, :3, :3]

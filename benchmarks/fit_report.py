@@ -5,6 +5,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+
 from fit_settings import CANDIDATES, DEFAULT, SETTINGS, default_of
 from held_out import COMPONENT_BYTES
 

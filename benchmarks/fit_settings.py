@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from rayfix_offline import trace
-from rayfix_offline.em import ExpectationMaximisation
-from rayfix_offline.tubes import TubeFit
+from rayfix_offline.fit.em import ExpectationMaximisation
+from rayfix_offline.fit.tubes import TubeFit
+from rayfix_offline.rays import trace
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from rayfix.evaluation.accuracy import Drop, drop_uniformly
-from rayfix.evaluation.paper.locate import PaperLocator
-from rayfix.evaluation.simulate import Noise, Timing, simulate_report
-from rayfix.evaluation.tables import open_or_build, table_parser
+from example_table import open_or_build, table_parser
+from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly
+from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
+from rayfix_evaluation.paper.locate import PaperLocator
 from rayfix_service.batch import locate_batch
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import Report
+from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.wire import parse_report
 
 CASES: list[tuple[str, Timing, bool]] = [

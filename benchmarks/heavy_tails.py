@@ -13,11 +13,19 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix.evaluation.accuracy import Drop, drop_positions, drops_at, solver_of
-from rayfix.evaluation.simulate import fold_direction, select_path
-from rayfix.evaluation.tables import open_or_build, table_parser
+from example_table import open_or_build, table_parser
+from rayfix_evaluation.drops.accuracy import Drop, drop_positions, drops_at, solver_of
+from rayfix_evaluation.drops.simulate import fold_direction, select_path
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import GAUSSIAN, HEAVY_TAILED, Angle, ErrorModel, Measurement, Range, Report
+from rayfix_service.fusion.measurements.report import (
+    GAUSSIAN,
+    HEAVY_TAILED,
+    Angle,
+    ErrorModel,
+    Measurement,
+    Range,
+    Report,
+)
 
 RANGE_STDEV = 0.5  # m
 CHI2_68 = 3.506  # of three degrees of freedom

@@ -9,10 +9,10 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline import trace
+from rayfix_offline.rays import trace
+from rayfix_offline.rays.trace import LevelRays, trace_station
 from rayfix_offline.site import SiteFile
-from rayfix_offline.trace import LevelRays, trace_station
-from rayfix_offline.twin import Twin
+from rayfix_offline.twin.twin import Twin
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES, TubeMixture, joint_cov, unpack
 
 REFERENCE_RATIO = 1.1

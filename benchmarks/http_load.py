@@ -34,7 +34,7 @@ import httpx
 from fastapi import FastAPI
 from fastapi.responses import JSONResponse
 
-from rayfix_service.http.examples import FIX_EXAMPLE, REPORT_EXAMPLES
+from rayfix_service.http.openapi.examples import FIX_EXAMPLE, REPORT_EXAMPLES
 from rayfix_service.wire import ReportDocument
 
 REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]

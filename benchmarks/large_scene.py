@@ -19,9 +19,9 @@ import trimesh
 
 from rayfix_offline.build import build_table
 from rayfix_offline.check import check_site
-from rayfix_offline.scene import load_scene
+from rayfix_offline.scene.scene import load_scene
 from rayfix_offline.site import read_site
-from rayfix_offline.twin import prepare_scene
+from rayfix_offline.twin.twin import prepare_scene
 
 HALL = (40.0, 60.0, 8.0)
 

@@ -22,11 +22,11 @@ from typing import Any
 import aiomqtt
 import numpy as np
 
-from rayfix.evaluation.accuracy import drops_at, solver_of
-from rayfix.evaluation.simulate import select_path
-from rayfix.evaluation.tables import open_or_build, table_parser
-from rayfix.evaluation.walks import walk
+from example_table import open_or_build, table_parser
+from rayfix_evaluation.drops.accuracy import drops_at, solver_of
+from rayfix_evaluation.drops.simulate import select_path
 from rayfix_tables.table import Table
+from walks import walk
 
 STDEV_DEG = 2.0
 

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from rayfix.evaluation.accuracy import drops_at, locate_drops, solver_of
-from rayfix.evaluation.planning.forecast import PlanMap, PlanSettings, draw_places, forecast
-from rayfix.evaluation.planning.heard import heard_paths
-from rayfix.evaluation.simulate import Noise, Timing
-from rayfix.evaluation.tables import open_or_build, table_parser
+from example_table import open_or_build, table_parser
+from rayfix_evaluation.drops.accuracy import drops_at, locate_drops, solver_of
+from rayfix_evaluation.drops.simulate import Noise, Timing
+from rayfix_evaluation.planning.forecast import PlanMap, PlanSettings, draw_places, forecast
+from rayfix_evaluation.planning.station_mixture import heard_paths
 from rayfix_service.fusion.locator import Locator
 from rayfix_tables.angles import direction
 from rayfix_tables.table import Table

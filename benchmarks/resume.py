@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from rayfix.example.files import write_example
-from rayfix_offline.shards import ShardStore
+from rayfix_offline.job.shards import ShardStore
 from rayfix_tables.table import Table
 
 POLL = 0.005

@@ -13,11 +13,11 @@ import numpy as np
 import trimesh
 
 from rayfix.example.hall import HALL_SIZE, hall_scene
-from rayfix_offline.cells import assemble_level, fit_cells, widen_cells
-from rayfix_offline.plan import plan_build
+from rayfix_offline.fit.cells import assemble_level, fit_cells, widen_cells
+from rayfix_offline.job.plan import plan_build
+from rayfix_offline.rays.trace import level_grid, trace_station
 from rayfix_offline.site import SiteFile, read_site
-from rayfix_offline.trace import level_grid, trace_station
-from rayfix_offline.twin import prepare_twin
+from rayfix_offline.twin.twin import prepare_twin
 from rayfix_tables.level import Level
 
 SITE = """\

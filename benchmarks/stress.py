@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix.evaluation.accuracy import Drop, drop_positions, drops_at, solver_of
-from rayfix.evaluation.simulate import Noise, Timing, simulate_report
-from rayfix.evaluation.stress import (
+from example_table import open_or_build, table_parser
+from rayfix_evaluation.drops.accuracy import Drop, drop_positions, drops_at, solver_of
+from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
+from rayfix_evaluation.drops.stress import (
     move_scene,
     with_late_time,
     with_random_angle,
     with_scaled_stdevs,
     with_turned_stations,
 )
-from rayfix.evaluation.tables import open_or_build, table_parser
-from rayfix_service.fusion.fix import Fix
 from rayfix_service.fusion.locator import Locator
+from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.wire import parse_report
 from rayfix_tables.table import Table
 

@@ -12,17 +12,17 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from held_out import log_densities
 
-from rayfix.evaluation.accuracy import drop_uniformly
-from rayfix.evaluation.simulate import Noise, simulate_report
+from held_out import log_densities
 from rayfix.example.files import SCENE_FILE, write_example
 from rayfix.example.hall import hall_scene
+from rayfix_evaluation.drops.accuracy import drop_uniformly
+from rayfix_evaluation.drops.simulate import Noise, simulate_report
 from rayfix_offline.build import BuildSummary, build_table
-from rayfix_offline.em import sample_points
+from rayfix_offline.fit.em import sample_points
+from rayfix_offline.rays.trace import trace_station
 from rayfix_offline.site import read_site
-from rayfix_offline.trace import trace_station
-from rayfix_offline.twin import prepare_twin
+from rayfix_offline.twin.twin import prepare_twin
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.wire import parse_report
 from rayfix_tables.table import Table

@@ -17,14 +17,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from rayfix.evaluation.calibration import ellipsoid_holds
-from rayfix.evaluation.uwb import ANCHORS, Ranging, least_squares, read_ranging, site_text
+from rayfix_evaluation.drops.calibration import ellipsoid_holds
 from rayfix_offline.build import build_table
-from rayfix_service.fusion.fix import Fix
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import Height, Range, Report
+from rayfix_service.fusion.measurements.report import Height, Range, Report
+from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.table import Table
+from uwb_recordings import ANCHORS, Ranging, least_squares, read_ranging, site_text
 
 Array = NDArray[np.float64]
 

@@ -15,19 +15,19 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from held_out import COMPONENT_BYTES, REFERENCE_RATIO, log_density_as_measured, trace_sliced, trace_window
 from numpy.typing import NDArray
 
-from rayfix.evaluation.accuracy import Drop, drop_uniformly, locate_drops
-from rayfix.evaluation.simulate import Noise
-from rayfix.evaluation.tables import open_or_build, table_parser
+from example_table import open_or_build, table_parser
+from held_out import COMPONENT_BYTES, REFERENCE_RATIO, log_density_as_measured, trace_sliced, trace_window
 from rayfix.example.files import write_example
-from rayfix_offline.coarse import CoarseFit, sum_cells
-from rayfix_offline.em import ExpectationMaximisation, fit_em, sample_points
+from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly, locate_drops
+from rayfix_evaluation.drops.simulate import Noise
+from rayfix_offline.fit.em import ExpectationMaximisation, fit_em, sample_points
+from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.fit.wide_windows import CoarseFit, sum_cells
+from rayfix_offline.rays.trace import LevelRays, level_grid
 from rayfix_offline.site import SiteFile, read_site
-from rayfix_offline.trace import LevelRays, level_grid
-from rayfix_offline.tubes import TubeFit, fit_tubes
-from rayfix_offline.twin import prepare_twin
+from rayfix_offline.twin.twin import prepare_twin
 from rayfix_service.fusion.locator import Locator
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture

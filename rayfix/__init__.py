@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from rayfix.api import build as build
     from rayfix.client import AsyncClient as AsyncClient
     from rayfix.client import Client as Client
-    from rayfix_service.fusion.fix import Fix as Fix
-    from rayfix_service.fusion.posterior import Posterior as Posterior
-    from rayfix_service.fusion.report import Report as Report
-    from rayfix_service.impulse_response import range_from_impulse_response as range_from_impulse_response
-    from rayfix_service.ranging import range_from_round_trip as range_from_round_trip
-    from rayfix_service.ranging import range_from_rssi as range_from_rssi
-    from rayfix_service.ranging import range_from_times as range_from_times
+    from rayfix_service.fusion.measurements.report import Report as Report
+    from rayfix_service.fusion.posterior.fix import Fix as Fix
+    from rayfix_service.fusion.posterior.posterior import Posterior as Posterior
+    from rayfix_service.measuring.impulse_response import range_from_impulse_response as range_from_impulse_response
+    from rayfix_service.measuring.ranging import range_from_round_trip as range_from_round_trip
+    from rayfix_service.measuring.ranging import range_from_rssi as range_from_rssi
+    from rayfix_service.measuring.ranging import range_from_times as range_from_times
 
 __version__ = software_version()
 

@@ -10,14 +10,14 @@ from rayfix_tables.table import Table
 
 with needs_extra("service"):
     from rayfix_service.batch import locate_batch
-    from rayfix_service.fusion.fix import Fix
     from rayfix_service.fusion.locator import Fused
     from rayfix_service.fusion.locator import Locator as _Locator
-    from rayfix_service.fusion.posterior import Posterior
-    from rayfix_service.fusion.report import Report
+    from rayfix_service.fusion.measurements.report import Report
+    from rayfix_service.fusion.posterior.fix import Fix
+    from rayfix_service.fusion.posterior.posterior import Posterior
     from rayfix_service.fusion.settings import FusionSettings
-    from rayfix_service.impulse_response import range_from_impulse_response
-    from rayfix_service.ranging import range_from_round_trip, range_from_rssi, range_from_times
+    from rayfix_service.measuring.impulse_response import range_from_impulse_response
+    from rayfix_service.measuring.ranging import range_from_round_trip, range_from_rssi, range_from_times
     from rayfix_service.tracking.settings import TrackingSettings
     from rayfix_service.tracking.tracker import Tracker as _Tracker
     from rayfix_service.wire import parse_report

@@ -17,7 +17,7 @@ import numpy as np
 from rayfix.console import build_progress, counted, place, print_build_summary
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths, report_text, simulate_example_report
 from rayfix.example.files import REPORT_FILE, write_example
-from rayfix.plot import plot_fix
+from rayfix_evaluation.pictures.plot import plot_fix
 from rayfix_offline.build import build_table
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table

@@ -7,8 +7,7 @@ import pytest
 
 from rayfix.example.files import write_example
 from rayfix_offline.build import build_table
-
-SHARED = Path(__file__).resolve().parents[2] / "shared"
+from tests.support.checkout import SHARED
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.http.tables import load_table
+from rayfix_service.http.answering.served_tables import load_table
 from rayfix_tables.angles import direction
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid

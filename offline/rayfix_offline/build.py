@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from joblib import Parallel, delayed
 
-from rayfix_offline.balance import balanced
-from rayfix_offline.former import read_former
-from rayfix_offline.holes import LOST_RAYS_WARNING
-from rayfix_offline.plan import StationPlan, plan_build
-from rayfix_offline.shards import ShardStore
+from rayfix_offline.fit.normalise import balanced
+from rayfix_offline.job.plan import StationPlan, plan_build
+from rayfix_offline.job.previous_table import read_former
+from rayfix_offline.job.shards import ShardStore
+from rayfix_offline.job.station import BuiltStation, Job, StationProgress, build_station, keep_station
+from rayfix_offline.rays.lost_rays import LOST_RAYS_WARNING
 from rayfix_offline.site import SiteFile, read_site
-from rayfix_offline.station import BuiltStation, Job, StationProgress, build_station, keep_station
-from rayfix_offline.twin import Twin, prepare_twin, refuse_errors
+from rayfix_offline.twin.twin import Twin, prepare_twin, refuse_errors
 from rayfix_tables.errors import BuildError
 from rayfix_tables.version import software_version
 from rayfix_tables.write import SceneContent, StationContent, check_writable, write_table
 
 if TYPE_CHECKING:
-    from rayfix_offline.cluster import Cluster
+    from rayfix_offline.job.cluster import Cluster
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, the cells that are done and the cells that there are in all (0 while not yet known)."""
@@ -206,7 +206,7 @@ def _keeps_balance(station: BuiltStation) -> bool:
 def _connect(address: str, site: SiteFile, twin: Twin) -> "Cluster":
     """Connect to a cluster; only this needs Dask."""
     try:
-        from rayfix_offline.cluster import Cluster
+        from rayfix_offline.job.cluster import Cluster
     except ModuleNotFoundError as error:
         raise BuildError(
             f"the module '{error.name}' is not installed; install it with: pip install 'rayfix[cluster]'"

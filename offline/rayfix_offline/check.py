@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rayfix_offline.findings import Finding
-from rayfix_offline.holes import LOST_RAYS_WARNING, Escapes, find_escapes
+from rayfix_offline.rays.lost_rays import LOST_RAYS_WARNING, Escapes, find_escapes
 from rayfix_offline.site import read_site
-from rayfix_offline.twin import Twin, prepare_twin
+from rayfix_offline.twin.findings import Finding
+from rayfix_offline.twin.twin import Twin, prepare_twin
 
 NOTABLE_SHARE = 0.05
 """A place that at least this share of the escaping rays pass is named."""

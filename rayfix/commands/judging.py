@@ -51,7 +51,7 @@ def add_commands(add: AddCommand) -> None:
 
 def _plan(options: argparse.Namespace) -> int:
     with needs_extra("all"):
-        from rayfix.plan import plan_document, plan_lines, plan_settings, plan_tables
+        from rayfix_evaluation.planning.plan import plan_document, plan_lines, plan_settings, plan_tables
     settings = plan_settings(
         height=options.height,
         azimuth_stdev_deg=options.azimuth_stdev_deg,
@@ -72,7 +72,7 @@ def _plan(options: argparse.Namespace) -> int:
 
 def _evaluate(options: argparse.Namespace) -> int:
     with needs_extra("evaluate"):
-        from rayfix.evaluation.report.write import PAGE, run_evaluation
+        from rayfix_evaluation.report.write import PAGE, run_evaluation
 
     from rayfix.console import evaluation_progress, print_evaluation
 

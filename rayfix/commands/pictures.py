@@ -51,9 +51,9 @@ def _view(options: argparse.Namespace) -> int:
 
 def _plot(options: argparse.Namespace) -> int:
     with needs_extra("all"):
-        from rayfix.picture import check_picture
-        from rayfix.report_plot import plot_report
         from rayfix.view import read_reports
+        from rayfix_evaluation.pictures.files import check_picture
+        from rayfix_evaluation.pictures.report_plot import plot_report
         from rayfix_service.fusion.locator import Locator
         from rayfix_service.wire import fix_to_document, parse_report
         from rayfix_tables.errors import ReportError

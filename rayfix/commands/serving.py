@@ -48,8 +48,8 @@ def add_commands(add: AddCommand) -> None:
 
 def _serve(options: argparse.Namespace) -> int:
     with needs_extra("service"):
-        from rayfix_service.http.server import is_loopback, serve
         from rayfix_service.http.settings import ServiceSettings
+        from rayfix_service.server.server import is_loopback, serve
     serve(
         options.tables,
         host=options.host,
@@ -71,6 +71,6 @@ def _serve(options: argparse.Namespace) -> int:
 
 def _api_key(options: argparse.Namespace) -> int:
     with needs_extra("service"):
-        from rayfix_service.http.keys import add_key
+        from rayfix_service.http.access.keys import add_key
     print(add_key(options.output, options.name))
     return 0

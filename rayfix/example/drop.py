@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from rayfix.evaluation.forward import ForwardSolver, Paths
-from rayfix.evaluation.simulate import Noise, simulate_report
 from rayfix.example.hall import hall_scene, hall_stations
+from rayfix_evaluation.drops.simulate import Noise, simulate_report
+from rayfix_evaluation.truth.forward import ForwardSolver, Paths
 
 EXAMPLE_POSITION = (5.32, 14.2, 0.67)
 """Position of the UE, m."""

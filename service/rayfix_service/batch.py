@@ -15,9 +15,9 @@ from typing import Any
 
 from joblib import Parallel, delayed, effective_n_jobs
 
-from rayfix_service.fusion.fix import Fix
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import Report
+from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.wire import parse_report
 from rayfix_tables.errors import RayfixError, ReportError, TableError

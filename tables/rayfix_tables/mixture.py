@@ -107,7 +107,7 @@ class TubeMixture:
 
     @property
     def tubes(self) -> tuple[NDArray[Any], ...]:
-        """Arrays that :func:`~rayfix_tables.conditioning.condition_on_angle` begins with."""
+        """Arrays that :func:`~rayfix_tables.gaussians.conditioning.condition_on_angle` begins with."""
         return self.log_weight, self.u_mean, self.u_cov, self.x_mean, self.jacobian, self.x_cov
 
     def __getitem__(self, index: slice | NDArray[np.int64]) -> "TubeMixture":

@@ -9,11 +9,12 @@ from urllib.parse import urlsplit
 import pytest
 
 from rayfix_service.web.assets import load_assets
+from tests.support.checkout import ROOT
 from tests.support.server_process import start_rayfix_serve
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
-ARTEFACTS = Path(__file__).resolve().parents[2] / "browser-artefacts"
+ARTEFACTS = ROOT / "browser-artefacts"
 
 FLAGS = [
     "--no-sandbox",

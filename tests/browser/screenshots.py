@@ -14,11 +14,11 @@ import pytest
 from PIL import Image
 
 from rayfix.cli import main
-from rayfix.evaluation.forward import ForwardSolver
-from rayfix.evaluation.simulate import simulate_report
 from rayfix.example.drop import EXAMPLE_NOISE
 from rayfix.example.files import write_example
 from rayfix.example.hall import hall_scene, hall_stations
+from rayfix_evaluation.drops.simulate import simulate_report
+from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_offline.build import build_table
 from tests.support.server_process import start_rayfix_serve
 

@@ -13,10 +13,10 @@ import pytest
 from PIL import Image
 
 from rayfix.cli import main
-from rayfix.evaluation.forward import ForwardSolver
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths, report_text, simulate_example_report
 from rayfix.example.hall import hall_scene, hall_stations
-from rayfix_service.http.keys import add_key
+from rayfix_evaluation.truth.forward import ForwardSolver
+from rayfix_service.http.access.keys import add_key
 from tests.support.server_process import start_rayfix_serve
 
 expect = pytest.importorskip("playwright.sync_api", reason="playwright is not installed").expect

@@ -1,9 +1,8 @@
 """Where the deployment's files are."""
 
 import sys
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.checkout import ROOT
 
 # The scripts of the images import each other, as they do when they are run.
 sys.path[:0] = [str(ROOT / "docker"), str(ROOT / "docker/stages")]

@@ -7,12 +7,13 @@ import pytest
 import yaml
 
 from rayfix.cli import make_parser
-from rayfix_service.http.keys import read_key_file
+from rayfix_service.http.access.keys import read_key_file
+from tests.support.checkout import ROOT
 
 helm_python = pytest.importorskip("helm_python", reason="Helm's library has no wheel for this machine")
 kubernetes_validate = pytest.importorskip("kubernetes_validate")
 
-CHART = Path(__file__).resolve().parents[2] / "docker/helm/rayfix"
+CHART = ROOT / "docker/helm/rayfix"
 KUBERNETES = ("1.30", "1.34")
 TABLE_ID = "0123456789abcdef" * 4
 KEY = "gateway:" + "0123456789abcdef" * 4

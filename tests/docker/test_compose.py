@@ -12,11 +12,12 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from imagetest.composition import HONOURED, WITHOUT_ENGINE, Composition
 from rayfix.cli import make_parser
-from rayfix_service.fusion.fix import Status
-from rayfix_service.http.keys import ApiKeys
-from rayfix_service.http.metrics import Metrics
+from rayfix_service.fusion.posterior.fix import Status
+from rayfix_service.http.access.keys import ApiKeys
+from rayfix_service.http.telemetry.metrics import Metrics
+from tests.support.checkout import ROOT
 
-DOCKER = Path(__file__).resolve().parents[2] / "docker"
+DOCKER = ROOT / "docker"
 CONFIG = {"Entrypoint": ["python", "start.py"], "Cmd": ["--help"], "Env": ["A=1", "B=x=y"], "User": "10001:10001"}
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from requirements import requirements
+from tests.support.checkout import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 OFFLINE_ONLY = {"trimesh", "scikit-learn", "embreex", "scipy", "networkx", "distributed", "ifcopenshell"}
 
 

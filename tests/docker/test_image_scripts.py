@@ -12,8 +12,9 @@ import pytest
 
 from compile_service_kernels import ROOM, write_room
 from rayfix_tables.table import Table
+from tests.support.checkout import ROOT
 
-IMAGE = Path(__file__).resolve().parents[2] / "docker/image"
+IMAGE = ROOT / "docker/image"
 
 
 class Quiet(SimpleHTTPRequestHandler):

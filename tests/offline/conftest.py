@@ -9,11 +9,11 @@ import pytest
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from rayfix_offline.engine import EmbreeEngine
-from rayfix_offline.launch import launch
-from rayfix_offline.materials import Reflectivity, constant_reflectivity
-from rayfix_offline.planes import merge_coplanar
-from rayfix_offline.segments import Segments
+from rayfix_offline.rays.launch import launch
+from rayfix_offline.rays.segments import Segments
+from rayfix_offline.scene.engine import EmbreeEngine
+from rayfix_offline.scene.materials import Reflectivity, constant_reflectivity
+from rayfix_offline.twin.planes import merge_coplanar
 from tests.support.rooms import CABINET, ROOM, TABLE, scene_of_boxes
 from tests.support.shapes import box
 

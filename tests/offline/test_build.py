@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from rayfix_offline.build import build_table
-from rayfix_offline.trace import level_grid
+from rayfix_offline.rays.trace import level_grid
 from rayfix_tables.angles import direction, local_to_scene
 from rayfix_tables.errors import SceneError, SiteError, TableError
 from rayfix_tables.table import Table

@@ -10,9 +10,9 @@ import trimesh
 
 from rayfix.cli import main
 from rayfix_offline.check import check_site
-from rayfix_offline.holes import find_escapes
+from rayfix_offline.rays.lost_rays import find_escapes
 from rayfix_offline.site import read_site
-from rayfix_offline.twin import prepare_twin
+from rayfix_offline.twin.twin import prepare_twin
 
 WriteSite = Callable[..., Path]
 

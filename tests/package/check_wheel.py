@@ -44,7 +44,7 @@ def main() -> None:
 
 PAGE = """
 import asyncio, httpx, pathlib
-from rayfix_service.http.app import create_app
+from rayfix_service.server.app import create_app
 from rayfix_service.web.assets import load_assets
 
 async def main():

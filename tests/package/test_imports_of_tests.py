@@ -3,7 +3,9 @@
 import ast
 from pathlib import Path
 
-TESTS = Path(__file__).resolve().parents[1]
+from tests.support.checkout import ROOT
+
+TESTS = ROOT / "tests"
 
 
 def imported_by(path: Path) -> set[str]:

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix.evaluation.forward import ForwardSolver, Paths
 from rayfix.example.hall import HALL_SIZE, hall_stations
+from rayfix_evaluation.truth.forward import ForwardSolver, Paths
 
 Array = NDArray[np.float64]
 EXACT = 1e-9  # m and rad

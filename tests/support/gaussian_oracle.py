@@ -11,7 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import norm
 
-from rayfix_service.fusion.report import GAUSSIAN, Angle, Height, LogRange, Measurement, Range, TimeOfArrival
+from rayfix_service.fusion.measurements.report import (
+    GAUSSIAN,
+    Angle,
+    Height,
+    LogRange,
+    Measurement,
+    Range,
+    TimeOfArrival,
+)
 from tests.support.hand_tables import GRID, MAX_PATH_LENGTH, ORIGIN, SIDE, WINDOW, Array, Tube
 
 EPSILON = 0.01

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rayfix_service.fusion.report import Angle, Measurement, Range, Report, TimeDifference, TimeOfArrival
+from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, Report, TimeDifference, TimeOfArrival
 from rayfix_service.fusion.settings import FusionSettings
 from tests.support.hand_tables import GRID, POSITIONS, Tube, line_of_sight
 

@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.gaussians.normal_points import normal_points
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import unpack
-from rayfix_tables.normal import normal_points
 
 Array = NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rayfix_offline.segments import Sequences
+from rayfix_offline.rays.segments import Sequences
 
 
 def no_reflections() -> Sequences:

@@ -3,7 +3,7 @@
 import copy
 from typing import Any
 
-from rayfix_service.http.examples import REPORT_EXAMPLES
+from rayfix_service.http.openapi.examples import REPORT_EXAMPLES
 
 REPORT: dict[str, Any] = REPORT_EXAMPLES["angle_and_time"]["value"]
 """The example: an angle and a range of one station, of a target at (7.0, 4.0, 1.5)."""

@@ -19,10 +19,10 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from rayfix_offline.scene import Scene
+from rayfix_offline.rays.trace import LevelRays, trace_station
+from rayfix_offline.scene.scene import Scene
 from rayfix_offline.site import SiteFile, read_site
-from rayfix_offline.trace import LevelRays, trace_station
-from rayfix_offline.twin import Twin, prepare_twin
+from rayfix_offline.twin.twin import Twin, prepare_twin
 
 ROOM = ((0.0, 0.0, 0.0), (4.0, 5.0, 3.0))
 CABINET = ((0.5, 1.0, 0.0), (1.3, 2.2, 1.8))

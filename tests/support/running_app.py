@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 import httpx
 from fastapi import FastAPI
 
-from rayfix_service.http.app import create_app
 from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.server.app import create_app
 
 T = TypeVar("T")
 

@@ -14,7 +14,7 @@ import httpx
 _SERVE = """\
 import json, sys
 from pydantic import TypeAdapter
-from rayfix_service.http.server import serve
+from rayfix_service.server.server import serve
 from rayfix_service.http.settings import ServiceSettings
 options = json.loads(sys.argv[2])
 settings = TypeAdapter(ServiceSettings).validate_python(options.pop("settings", {}))
@@ -105,7 +105,7 @@ class ServerProcess:
 
 
 def start_server(tables: Path, *, workers: int = 1, **options: object) -> ServerProcess:
-    """Start ``rayfix_service.http.server.serve``, without the face, with other arguments of it."""
+    """Start ``rayfix_service.server.server.serve``, without the face, with other arguments of it."""
     text = json.dumps({"port": 0, "workers": workers, **options})
     return ServerProcess("-c", _SERVE, tables, text, workers=workers)
 

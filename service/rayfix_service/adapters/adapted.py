@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import ValidationError
 
-from rayfix_service.fusion.report import Angle, Height, Measurement, Report, TimeOfArrival
+from rayfix_service.fusion.measurements.report import Angle, Height, Measurement, Report, TimeOfArrival
 from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportError
 from rayfix_service.wire.documents import HeightDocument
 from rayfix_service.wire.problems import Path, path_text

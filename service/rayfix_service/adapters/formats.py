@@ -9,8 +9,8 @@ from rayfix_service.adapters.omlox import fix_to_omlox
 from rayfix_service.adapters.silabs import parse_silabs
 from rayfix_service.adapters.threegpp import fix_to_3gpp
 from rayfix_service.adapters.ublox import parse_ublox
-from rayfix_service.fusion.fix import Fix
-from rayfix_service.fusion.report import Height
+from rayfix_service.fusion.measurements.report import Height
+from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report
 from rayfix_service.wire.problems import path_text

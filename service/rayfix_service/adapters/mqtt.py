@@ -17,7 +17,7 @@ from rayfix_service.adapters.formats import OutputFormat, write
 from rayfix_service.adapters.omlox_hub import HubSettings, OmloxHub, open_hub
 from rayfix_service.adapters.silabs_stream import SilabsStream
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.fusion.report import Frame, Height
+from rayfix_service.fusion.measurements.report import Frame, Height
 from rayfix_service.tracking.tracker import Tracker
 from rayfix_tables.errors import RayfixError, ReportError
 

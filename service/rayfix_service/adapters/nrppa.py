@@ -24,8 +24,8 @@ from rayfix_service.adapters.nrppa_documents import (
     Zoa,
 )
 from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_interval, time_interval
-from rayfix_service.fusion.directions import to_scene
-from rayfix_service.fusion.report import Angle, Measurement, Range, TimeOfArrival
+from rayfix_service.fusion.measurements.directions import to_scene
+from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, TimeOfArrival
 from rayfix_service.wire.problems import Path
 from rayfix_tables.angles import wrap_one
 from rayfix_tables.site import Station

@@ -4,8 +4,8 @@ import math
 from typing import Any
 
 from rayfix_service.adapters.positions import best_candidate
-from rayfix_service.fusion.fix import Fix
-from rayfix_service.moments import utc_milliseconds
+from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.measuring.timestamps import utc_milliseconds
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_tables.site import SiteInfo
 

@@ -17,7 +17,7 @@ from urllib.parse import quote, urlsplit
 import httpx
 
 from rayfix_service.adapters.omlox import fix_to_omlox
-from rayfix_service.fusion.fix import Fix
+from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.site import SiteInfo

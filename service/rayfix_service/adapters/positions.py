@@ -1,7 +1,7 @@
 """What formats that know one position alone take from a fix, or from the track that it went into."""
 
-from rayfix_service.fusion.credible import CredibleRegions
-from rayfix_service.fusion.fix import Candidate, Fix
+from rayfix_service.fusion.posterior.credible import CredibleRegions
+from rayfix_service.fusion.posterior.fix import Candidate, Fix
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_tables.errors import ReportError
 

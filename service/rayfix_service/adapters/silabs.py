@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from rayfix_service.adapters.adapted import Adapted, adapted_report, station_of
 from rayfix_service.adapters.documents import KnownHeight, Stations, TargetId, Timestamp, check
-from rayfix_service.fusion.report import Angle, Frame, Measurement, Range
+from rayfix_service.fusion.measurements.report import Angle, Frame, Measurement, Range
 from rayfix_service.wire import MAX_MEASUREMENTS, WireModel
 from rayfix_service.wire.fields import misfit
 from rayfix_service.wire.problems import Path

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 
 from rayfix_service.adapters.adapted import Adapted, adapted_report, station_of
-from rayfix_service.adapters.joining import Joiner, Transmission
 from rayfix_service.adapters.silabs import LEAST_STDEV_DEG, SilabsAngle, parse_silabs_angle, silabs_measurements
-from rayfix_service.fusion.report import Frame, Height
+from rayfix_service.adapters.transmissions import Joiner, Transmission
+from rayfix_service.fusion.measurements.report import Frame, Height
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rayfix_service.adapters.positions import best_candidate
-from rayfix_service.fusion.fix import Fix
+from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_tables.site import SiteInfo
 

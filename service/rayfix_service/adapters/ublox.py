@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rayfix_service.adapters.adapted import Adapted, adapted_report, station_of
-from rayfix_service.adapters.joining import Joiner
-from rayfix_service.fusion.report import Angle
+from rayfix_service.adapters.transmissions import Joiner
+from rayfix_service.fusion.measurements.report import Angle
 from rayfix_service.wire import MAX_REPORTS, FieldProblem, InvalidReportError
 from rayfix_service.wire.problems import Path, shown
 from rayfix_tables.angles import wrap_one

@@ -4,17 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rayfix_service.fusion.beam import Hypotheses, multiply
-from rayfix_service.fusion.credible import CredibleRegions
-from rayfix_service.fusion.factors import Factor, make_factor
-from rayfix_service.fusion.fix import Fix
-from rayfix_service.fusion.fixes import Product, make_fix
-from rayfix_service.fusion.heard import HeardStation
-from rayfix_service.fusion.observations import Observation, SortedReport, sort_report
-from rayfix_service.fusion.points import DrawnPoints
-from rayfix_service.fusion.posterior import Posterior, make_posterior
-from rayfix_service.fusion.prior import Prior, even_prior, height_prior
-from rayfix_service.fusion.report import Angle, Range, Report
+from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
+from rayfix_service.fusion.measurements.report import Angle, Range, Report
+from rayfix_service.fusion.posterior.credible import CredibleRegions
+from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.fusion.posterior.fixes import Product, make_fix
+from rayfix_service.fusion.posterior.points import DrawnPoints
+from rayfix_service.fusion.posterior.posterior import Posterior, make_posterior
+from rayfix_service.fusion.product.beam import Hypotheses, multiply
+from rayfix_service.fusion.product.factors import Factor, make_factor
+from rayfix_service.fusion.product.prior import Prior, even_prior, height_prior
+from rayfix_service.fusion.product.station_mixture import HeardStation
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.table import Table
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.beam import Hypotheses
-from rayfix_service.fusion.prior import Prior
+from rayfix_service.fusion.product.beam import Hypotheses
+from rayfix_service.fusion.product.prior import Prior
 
 Array = NDArray[np.float64]
 

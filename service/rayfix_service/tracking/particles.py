@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.beam import Hypotheses
+from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.tracking.likelihood import Likelihood
 from rayfix_service.tracking.motion import MotionModel, Step, step_of
 from rayfix_service.tracking.walls import Walls

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from rayfix_service.fusion.credible import CredibleRegions
+    from rayfix_service.fusion.posterior.credible import CredibleRegions
 
 TrackState = Literal["started", "updated", "restarted", "predicted", "late"]
 """What a report did to its target's track; docs/tracking.md defines each."""

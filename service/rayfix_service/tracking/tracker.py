@@ -10,10 +10,10 @@ from time import monotonic
 
 import numpy as np
 
-from rayfix_service.fusion.credible import CredibleRegions
 from rayfix_service.fusion.locator import Fused
-from rayfix_service.fusion.points import ListedPoints
-from rayfix_service.moments import utc_moment
+from rayfix_service.fusion.posterior.credible import CredibleRegions
+from rayfix_service.fusion.posterior.points import ListedPoints
+from rayfix_service.measuring.timestamps import utc_moment
 from rayfix_service.tracking.estimate import estimate
 from rayfix_service.tracking.likelihood import likelihood_of
 from rayfix_service.tracking.particles import Particles, birth, mixed, predict, update

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from rayfix_service.fusion.posterior import Posterior
+from rayfix_service.fusion.posterior.posterior import Posterior
 from rayfix_service.web.inspector import DirectionView
 from rayfix_service.web.simulation import SimulatedPath
 from rayfix_service.wire import (

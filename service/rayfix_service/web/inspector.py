@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.directions import Direction, in_field_of_view
-from rayfix_service.fusion.heard import HeardStation
-from rayfix_service.fusion.lookup import look_up
+from rayfix_service.fusion.lookup.lookup import look_up
+from rayfix_service.fusion.measurements.directions import Direction, in_field_of_view
+from rayfix_service.fusion.product.station_mixture import HeardStation
 from rayfix_tables.level import Level
 from rayfix_tables.table import StationPart
 

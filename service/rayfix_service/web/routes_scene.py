@@ -6,8 +6,8 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from rayfix_service.http.dependencies import TableDep
 from rayfix_service.http.problems import INVALID_PARAMETER, NOT_FOUND, NOT_READY, ProblemError, problem_responses
+from rayfix_service.http.routes.dependencies import TableDep
 from rayfix_service.web.documents import CoverageDocument, MixtureDocument, mixture_document
 from rayfix_service.web.glb import MEDIA_TYPE, write_glb
 from rayfix_service.web.inspector import mass_by_reflections, view_direction

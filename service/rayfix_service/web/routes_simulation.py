@@ -9,9 +9,9 @@ from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse
 
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.http.dependencies import ReportBody, TableDep
-from rayfix_service.http.examples import REPORT_EXAMPLES
-from rayfix_service.http.outputs import POSITION_PROBLEMS, request_body
+from rayfix_service.http.answering.slow_work import SlowFixes
+from rayfix_service.http.openapi.examples import REPORT_EXAMPLES
+from rayfix_service.http.openapi.responses import POSITION_PROBLEMS, request_body
 from rayfix_service.http.problems import (
     FORBIDDEN,
     INVALID_PARAMETER,
@@ -20,7 +20,7 @@ from rayfix_service.http.problems import (
     ProblemError,
     problem_responses,
 )
-from rayfix_service.http.slow_fixes import SlowFixes
+from rayfix_service.http.routes.dependencies import ReportBody, TableDep
 from rayfix_service.web.documents import (
     PosteriorDocument,
     SimulationDocument,

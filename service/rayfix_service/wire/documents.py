@@ -2,7 +2,7 @@
 
 from pydantic import ConfigDict, Field
 
-from rayfix_service.fusion.report import CONFIDENCE, Height
+from rayfix_service.fusion.measurements.report import CONFIDENCE, Height
 from rayfix_service.wire.fields import Confidence, HeightM, HeightStdevM, Rfc3339, WireModel
 from rayfix_service.wire.measurements import MeasurementDocument
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
-from rayfix_service.fusion.report import (
+from rayfix_service.fusion.measurements.report import (
     GAUSSIAN,
     HEAVY_TAILED,
     Angle,
@@ -16,7 +16,7 @@ from rayfix_service.fusion.report import (
     TimeDifference,
     TimeOfArrival,
 )
-from rayfix_service.ranging import range_from_rssi
+from rayfix_service.measuring.ranging import range_from_rssi
 from rayfix_service.wire.fields import (
     METRES_PER_NANOSECOND,
     ArrivalM,

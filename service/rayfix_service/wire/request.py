@@ -6,7 +6,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import from_json
 
-from rayfix_service.fusion.report import Report
+from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.wire.documents import ReportDocument
 from rayfix_service.wire.problems import InvalidReportError, MalformedJsonError, problems_of_validation
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from rayfix_service.fusion.fix import Fix, Status
+from rayfix_service.fusion.posterior.fix import Fix, Status
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.wire.points import Matrix, Point, point
 from rayfix_service.wire.track import TrackDocument, track_to_document

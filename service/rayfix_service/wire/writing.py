@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from rayfix_service.fusion.report import (
+from rayfix_service.fusion.measurements.report import (
     CONFIDENCE,
     GAUSSIAN,
     Angle,

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rayfix.evaluation.arrays.bound import cosine_bound
-from rayfix.evaluation.arrays.covariance import covariance, num_sources, smoothed_covariance
-from rayfix.evaluation.arrays.estimators import ESTIMATORS, delay_and_sum, esprit, music, mvdr, wave_powers
-from rayfix.evaluation.arrays.planar import PlanarArray, Signal, receive, to_cosines, to_scene_direction
-from rayfix.evaluation.forward import Paths
+from rayfix_evaluation.arrays.bound import cosine_bound
+from rayfix_evaluation.arrays.covariance import covariance, num_sources, smoothed_covariance
+from rayfix_evaluation.arrays.estimators import ESTIMATORS, delay_and_sum, esprit, music, mvdr, wave_powers
+from rayfix_evaluation.arrays.planar import PlanarArray, Signal, receive, to_cosines, to_scene_direction
+from rayfix_evaluation.truth.forward import Paths
 from rayfix_tables.angles import direction
 from rayfix_tables.site import Station
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from rayfix.evaluation.accuracy import Drop
-from rayfix.evaluation.arrays.picture import draw_angle_errors
-from rayfix.evaluation.arrays.planar import PlanarArray, Signal
-from rayfix.evaluation.arrays.statistics import AngleErrors, angle_statistics, fit_tails
-from rayfix.evaluation.arrays.study import ArrayStudy, angle_errors, statistics_rows, study_statistics
-from rayfix.evaluation.forward import ForwardSolver
-from rayfix_service.fusion.report import GAUSSIAN
+from rayfix_evaluation.arrays.picture import draw_angle_errors
+from rayfix_evaluation.arrays.planar import PlanarArray, Signal
+from rayfix_evaluation.arrays.statistics import AngleErrors, angle_statistics, fit_tails
+from rayfix_evaluation.arrays.study import ArrayStudy, angle_errors, statistics_rows, study_statistics
+from rayfix_evaluation.drops.accuracy import Drop
+from rayfix_evaluation.truth.forward import ForwardSolver
+from rayfix_service.fusion.measurements.report import GAUSSIAN
 from rayfix_service.wire import parse_report
 from rayfix_tables.site import Station
 

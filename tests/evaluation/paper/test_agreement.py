@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rayfix.evaluation.paper.algorithms import PaperSettings, algorithm_1, algorithm_2_joint
-from rayfix.evaluation.paper.locate import PaperLocator
-from rayfix.evaluation.paper.mixtures import Mixture, multiply
-from rayfix.evaluation.paper.points import Launcher, RayPoints, draw_directions, points_on_rays
-from rayfix.evaluation.paper.selection import RelativeLength, select_by_length
-from rayfix_service.fusion import beam
-from rayfix_service.fusion.directions import NO_DIRECTION, Direction
-from rayfix_service.fusion.factors import make_factor
-from rayfix_service.fusion.heard import HeardStation
-from rayfix_service.fusion.observations import sort_report
-from rayfix_service.fusion.prior import Prior
-from rayfix_service.fusion.report import Angle, Measurement, Range, Report, TimeDifference
+from rayfix_evaluation.paper.algorithms import PaperSettings, algorithm_1, algorithm_2_joint
+from rayfix_evaluation.paper.locate import PaperLocator
+from rayfix_evaluation.paper.mixtures import Mixture, multiply
+from rayfix_evaluation.paper.points import Launcher, RayPoints, draw_directions, points_on_rays
+from rayfix_evaluation.paper.selection import RelativeLength, select_by_length
+from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
+from rayfix_service.fusion.measurements.observations import sort_report
+from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, Report, TimeDifference
+from rayfix_service.fusion.product import beam
+from rayfix_service.fusion.product.factors import make_factor
+from rayfix_service.fusion.product.prior import Prior
+from rayfix_service.fusion.product.station_mixture import HeardStation
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.angles import angles_of
 from rayfix_tables.table import Table

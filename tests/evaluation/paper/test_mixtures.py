@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rayfix.evaluation.paper.mixtures import (
+from rayfix_evaluation.paper.mixtures import (
     Mixture,
     arg_max,
     condition_on_last,

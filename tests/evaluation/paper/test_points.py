@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from rayfix.evaluation.paper.points import Launcher, RayPoints, draw_directions, points_on_rays
-from rayfix.evaluation.paper.selection import RelativeLength, select_by_length, select_tuples
-from rayfix_offline.engine import EmbreeEngine
-from rayfix_offline.materials import constant_reflectivity
-from rayfix_offline.planes import merge_coplanar
-from rayfix_service.fusion.directions import NO_DIRECTION, Direction
+from rayfix_evaluation.paper.points import Launcher, RayPoints, draw_directions, points_on_rays
+from rayfix_evaluation.paper.selection import RelativeLength, select_by_length, select_tuples
+from rayfix_offline.scene.engine import EmbreeEngine
+from rayfix_offline.scene.materials import constant_reflectivity
+from rayfix_offline.twin.planes import merge_coplanar
+from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
 from rayfix_tables.angles import angles_of
 
 STATION = np.array([1.0, 2.0, 1.5])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rayfix.evaluation.paper.reports import sort_for_paper
-from rayfix_service.fusion.report import (
+from rayfix_evaluation.paper.reports import sort_for_paper
+from rayfix_service.fusion.measurements.report import (
     HEAVY_TAILED,
     Angle,
     Height,

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from rayfix.evaluation.accuracy import drops_at, locate_drops, solver_of
-from rayfix.evaluation.planning.floor import slice_mesh
-from rayfix.evaluation.planning.forecast import PlanMap, PlanSettings, draw_places, finite, forecast, summary
-from rayfix.evaluation.planning.picture import changes, draw_comparison, draw_plan
-from rayfix.evaluation.simulate import Noise, Timing
+from rayfix_evaluation.drops.accuracy import drops_at, locate_drops, solver_of
+from rayfix_evaluation.drops.simulate import Noise, Timing
+from rayfix_evaluation.planning.floor import slice_mesh
+from rayfix_evaluation.planning.forecast import PlanMap, PlanSettings, draw_places, finite, forecast, summary
+from rayfix_evaluation.planning.picture import changes, draw_comparison, draw_plan
 from rayfix_service.fusion.locator import Locator
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rayfix.evaluation.accuracy import solver_of
-from rayfix.evaluation.bound import path_gradients
-from rayfix.evaluation.planning.heard import heard_paths
+from rayfix_evaluation.drops.accuracy import solver_of
+from rayfix_evaluation.drops.bound import path_gradients
+from rayfix_evaluation.planning.station_mixture import heard_paths
 from rayfix_tables.angles import angles_of, wrap
 from rayfix_tables.table import Table
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from rayfix.evaluation.accuracy import Drop, drops_at
-from rayfix.evaluation.forward import ForwardSolver
-from rayfix.evaluation.studies.cases import Case, Simulated, in_view, simulate_case
+from rayfix_evaluation.drops.accuracy import Drop, drops_at
+from rayfix_evaluation.studies.cases import Case, Simulated, in_view, simulate_case
+from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_tables.site import Station, StationBias
 
 STATIONS = (

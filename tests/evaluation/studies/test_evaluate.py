@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rayfix.cli import main
-from rayfix.evaluation.report.tables import COLUMNS, study_rows
+from rayfix_evaluation.report.tables import COLUMNS, study_rows
 
 PAPER_FIGURES = {
     "scene",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 PARENT = """
 import multiprocessing, time
-from rayfix.evaluation.studies.pool import end_with_parent
+from rayfix_evaluation.studies.pool import end_with_parent
 
 def work(pids):
     import os

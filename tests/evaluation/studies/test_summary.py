@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rayfix.evaluation.studies.statements import check_statements
-from rayfix.evaluation.studies.summary import Run, percentile, probability_lower, summarise
+from rayfix_evaluation.studies.statements import check_statements
+from rayfix_evaluation.studies.summary import Run, percentile, probability_lower, summarise
 
 
 def run_of(error: np.ndarray, bound: float = 0.1, covered: np.ndarray | None = None) -> Run:

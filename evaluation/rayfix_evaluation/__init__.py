@@ -1,0 +1,1 @@
+"""Judging a site: simulated drops, bounds, baselines, the paper's method, planning maps, reports and pictures."""

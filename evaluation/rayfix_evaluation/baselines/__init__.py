@@ -1,0 +1,1 @@
+"""Other methods of locating, which rayfix is compared with."""

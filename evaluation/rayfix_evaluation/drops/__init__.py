@@ -1,0 +1,1 @@
+"""Simulated drops: reports of a UE at known positions, their fixes, errors, bounds and calibration."""

@@ -1,0 +1,151 @@
+"""Points along rays: where a signal can have come from, each with the length of its path.
+
+Steps 1 and 2 of the paper's Algorithm 1: directions are drawn around the measured angle of arrival (or, without one,
+from all around the station), rays are launched and mirrored, and points are set along them at regular steps.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.rays.launch import launch
+from rayfix_offline.rays.segments import Segments
+from rayfix_offline.scene.engine import EmbreeEngine, RayEngine
+from rayfix_offline.scene.materials import Reflectivity, constant_reflectivity
+from rayfix_offline.twin.planes import Planes, merge_coplanar
+from rayfix_service.fusion.measurements.directions import Direction
+from rayfix_tables.angles import direction
+from rayfix_tables.table import Table
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayPoints:
+    """Points on a station's rays.
+
+    Attributes
+    ----------
+    position : ndarray of shape (n, 3), m
+    path_length : ndarray of shape (n,), m
+        From the station along the ray, reflections included.
+    """
+
+    position: NDArray[np.float64]
+    path_length: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.path_length)
+
+    def take(self, index: NDArray[np.int64]) -> "RayPoints":
+        """Choose points, in the order of ``index``."""
+        return RayPoints(position=self.position[index], path_length=self.path_length[index])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Launcher:
+    """A scene to launch rays in.
+
+    Attributes
+    ----------
+    bounds : ndarray of shape (2, 3), m
+        Low and high corner of the scene.
+    max_path_length : float, m
+    """
+
+    engine: RayEngine
+    planes: Planes
+    reflectivity: Reflectivity
+    bounds: NDArray[np.float64]
+    max_reflections: int
+    max_path_length: float
+
+    @classmethod
+    def of_table(cls, table: Table) -> "Launcher":
+        """Launch in the scene that a table was built from, with its limits."""
+        propagation = table.site.document["propagation"]
+        triangles = np.asarray(table.scene.vertices, np.float64)[table.scene.faces]
+        corners = triangles.reshape(-1, 3)
+        return cls(
+            engine=EmbreeEngine(triangles),
+            planes=merge_coplanar(triangles),
+            # The paper's points have no power.
+            reflectivity=constant_reflectivity(len(triangles), loss_db=0.0),
+            bounds=np.stack([corners.min(axis=0), corners.max(axis=0)]),
+            max_reflections=int(propagation["max_reflections"]),
+            max_path_length=float(propagation["max_path_length_m"]),
+        )
+
+    def trace(self, station: NDArray[np.float64], directions: NDArray[np.float64]) -> Segments:
+        """Launch rays from a station, a position of shape (3,), m, in directions of shape (n_rays, 3), unit vectors."""
+        return launch(
+            station,
+            directions,
+            engine=self.engine,
+            planes=self.planes,
+            reflectivity=self.reflectivity,
+            bounds=self.bounds,
+            max_reflections=self.max_reflections,
+            max_path_length=self.max_path_length,
+        )
+
+
+def draw_directions(measured: Direction, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw launch directions from N(angle of arrival, R), or from all around where no angle was measured.
+
+    Parameters
+    ----------
+    measured : Direction
+        With both angles or with none; in the scene frame.
+    count : int
+
+    Returns
+    -------
+    ndarray of shape (count, 3)
+        Unit vectors.
+
+    Raises
+    ------
+    ValueError
+        If only one of the angles was measured.
+    """
+    if measured.azimuth is None and measured.zenith is None:
+        vectors = rng.standard_normal((count, 3))
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+    if measured.azimuth is None or measured.zenith is None:
+        raise ValueError("the paper's method takes azimuth and zenith or no angle; leave the single angle out")
+    angles = rng.multivariate_normal([measured.azimuth, measured.zenith], measured.cov, size=count)
+    return direction(angles[:, 0], angles[:, 1])
+
+
+def points_on_rays(
+    launcher: Launcher,
+    station: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    *,
+    step: float,
+    rng: np.random.Generator,
+) -> RayPoints:
+    """Launch rays and set points along them.
+
+    Parameters
+    ----------
+    station : ndarray of shape (3,), m
+    directions : ndarray of shape (n_rays, 3)
+        Unit vectors.
+    step : float, m
+        Between points of a ray; the first of each ray is a random part of it away from the station.
+    """
+    segments = launcher.trace(station, directions)
+    phase = step * rng.random(len(directions))
+    ray, depth = np.nonzero(segments.sequence >= 0)
+    first = np.ceil((segments.start[ray, depth] - phase[ray]) / step).astype(np.int64)
+    last = np.ceil((segments.end[ray, depth] - phase[ray]) / step).astype(np.int64)
+    counts = np.maximum(last - first, 0)
+    which = np.repeat(np.arange(len(ray)), counts)
+    number = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts) + first[which]
+    length = phase[ray[which]] + step * number
+    sequence = segments.sequence[ray, depth][which]
+    images, mirrors = segments.sequences.images, segments.sequences.mirrors
+    heading = np.einsum("nij,nj->ni", mirrors[segments.sequence[ray, depth]], directions[ray])
+    return RayPoints(position=images[sequence] + length[:, None] * heading[which], path_length=length)

@@ -1,0 +1,299 @@
+"""Forecast of the fixes over a floor: what stations would report from each place, located with the table itself."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_evaluation.drops.accuracy import clear_of_solids
+from rayfix_evaluation.drops.bound import information_bound
+from rayfix_evaluation.drops.simulate import Noise, Timing, fold_direction
+from rayfix_evaluation.planning.station_mixture import HeardPaths, heard_paths
+from rayfix_service.fusion.locator import Locator
+from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, Report, TimeDifference, TimeOfArrival
+from rayfix_tables.errors import RayfixError
+from rayfix_tables.site import Station
+from rayfix_tables.table import Table
+
+Array = NDArray[np.float64]
+
+Progress = Callable[[int, int], None]
+"""Told how many reports are located, and of how many."""
+
+_MARGIN = 0.06  # m; places nearer to solids are left out
+_TRIES = 10  # places that are tried for each that is drawn
+_CLOCK = 100.0  # m; where a simulated clock stands
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanSettings:
+    """What is planned for.
+
+    Attributes
+    ----------
+    height : float, m
+        z of the transmitters.
+    noise : Noise
+        Standard deviations of what is measured.
+    timing : {"none", "pt", "toa", "tdoa"}
+        Times that are measured besides the angles.
+    spacing : float, m
+        Side of the map's squares.
+    threshold : float, m
+        Error above which a fix is of no use.
+    draws : int
+        Reports from each square, each from another place in it and with its own noise.
+    seed : int
+        Of places and noise.
+
+    Raises
+    ------
+    RayfixError
+        If a setting is out of range.
+    """
+
+    height: float
+    noise: Noise
+    timing: Timing = "none"
+    spacing: float = 0.5
+    threshold: float = 1.0
+    draws: int = 4
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot be."""
+        for name in ("spacing", "threshold"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise RayfixError(f"the {name} is {value} m; it must be positive")
+        if not np.isfinite(self.height):
+            raise RayfixError(f"the height is {self.height} m; give the transmitters' z in the scene")
+        if self.draws < 1:
+            raise RayfixError(f"the number of draws is {self.draws}; give 1 or more")
+        if self.seed < 0:
+            raise RayfixError(f"the seed is {self.seed}; give 0 or more")
+        if self.timing != "none" and self.noise.range_stdev is None:
+            raise RayfixError(f"the timing is '{self.timing}', but the deviation of a range is not given; give it in m")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlanMap:
+    """Forecast for n squares of a floor.
+
+    Attributes
+    ----------
+    settings : PlanSettings
+    table_id : str
+    position : ndarray of shape (n, 3), m
+        Middles of the squares.
+    heard : ndarray of shape (n, n_stations)
+        Share of a square's places that each station of the site hears.
+    bound : ndarray of shape (n,), m
+        Root mean square of the position error bounds of the reported paths; infinite where one of them leaves a
+        direction open.
+    error : ndarray of shape (n,), m
+        Root mean square error to expect, rivals included; infinite where a report gives no fix.
+    within : ndarray of shape (n,)
+        Probability that the error is below the threshold.
+    """
+
+    settings: PlanSettings
+    table_id: str
+    position: Array
+    heard: Array
+    bound: Array
+    error: Array
+    within: Array
+
+    def __len__(self) -> int:
+        """Return the number of squares."""
+        return len(self.position)
+
+    @cached_property
+    def num_heard(self) -> Array:
+        """Mean number of stations that hear a place of each square, shape (n,)."""
+        return np.asarray(self.heard.sum(axis=1))
+
+    @property
+    def coverage(self) -> float:
+        """Share of all fixes whose error will be below the threshold."""
+        return float(self.within.mean())
+
+
+def forecast(table: Table, settings: PlanSettings, progress: Progress | None = None) -> PlanMap:
+    """Forecast the fixes of a table over a floor.
+
+    Raises
+    ------
+    RayfixError
+        If no place is free at this height.
+    """
+    rng = np.random.default_rng(settings.seed)
+    squares, places = draw_places(table, settings.height, settings.spacing, settings.draws, rng)
+    stations = table.site.stations
+    noise = rng.standard_normal((len(places), len(stations), 3))
+    paths = [heard_paths(table.levels(station.id)[0], places) for station in stations]
+    locator = Locator(table)
+    bound, square, within = np.empty(len(places)), np.empty(len(places)), np.empty(len(places))
+    for n in range(len(places)):
+        bound[n] = _bound(paths, n, settings)
+        square[n], within[n] = _outlook(locator, _measure(stations, paths, n, settings, noise[n]), settings.threshold)
+        if progress is not None:
+            progress(n + 1, len(places))
+    middles, first = np.unique(squares, axis=0, return_index=True)
+    shape = (len(middles), settings.draws)
+    heard = np.stack([path.heard for path in paths], axis=1)
+    assert np.array_equal(first, np.arange(len(middles)) * settings.draws)  # squares come whole and in order
+    return PlanMap(
+        settings=settings,
+        table_id=table.table_id,
+        position=middles,
+        heard=heard.reshape(*shape, -1).mean(axis=1),
+        bound=np.sqrt(np.square(bound).reshape(shape).mean(axis=1)),
+        error=np.sqrt(square.reshape(shape).mean(axis=1)),
+        within=within.reshape(shape).mean(axis=1),
+    )
+
+
+def draw_places(
+    table: Table, height: float, spacing: float, count: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Draw places from squares that tile a floor.
+
+    Parameters
+    ----------
+    height, spacing : float, m
+    count : int
+        Places of each square.
+
+    Returns
+    -------
+    squares : ndarray of shape (n * count, 3), m
+        Middle of the square of each place, ascending.
+    places : ndarray of shape (n * count, 3), m
+        In the free space. Squares that are hardly free are left out.
+
+    Raises
+    ------
+    RayfixError
+        If there is none.
+    """
+    free_space = table.scene.free_space
+    low = free_space.origin[:2]
+    high = low + np.array(free_space.free.shape[:2]) * free_space.voxel_size
+    axes = [np.arange(a + 0.5 * spacing, b, spacing) for a, b in zip(low, high, strict=True)]
+    x, y = np.meshgrid(*axes, indexing="ij")
+    middles = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=-1)
+    tried = np.repeat(middles[:, None], _TRIES * count, axis=1)
+    tried[..., :2] += spacing * (rng.random((*tried.shape[:2], 2)) - 0.5)
+    free = clear_of_solids(free_space, tried.reshape(-1, 3), margin=_MARGIN).reshape(tried.shape[:2])
+    usable = free.sum(axis=1) >= count
+    if not len(middles):
+        width, depth = high - low
+        raise RayfixError(
+            f"squares of {spacing:g} m do not fit into the building of {width:.2f} x {depth:.2f} m; give a smaller "
+            "spacing"
+        )
+    if not usable.any():
+        bottom = float(free_space.origin[2])
+        top = bottom + free_space.free.shape[2] * free_space.voxel_size
+        raise RayfixError(
+            f"nothing is free at a height of {height} m; the building reaches from {bottom:.2f} to {top:.2f} m"
+        )
+    # A stable sort brings the first free ones to the front.
+    chosen = np.argsort(~free[usable], axis=1, kind="stable")[:, :count]
+    places = np.take_along_axis(tried[usable], chosen[..., None], axis=1)
+    return np.repeat(middles[usable], count, axis=0), places.reshape(-1, 3)
+
+
+def _bound(paths: Sequence[HeardPaths], place: int, settings: PlanSettings) -> float:
+    """Bound as in :mod:`rayfix_evaluation.drops.bound`, from the gradients that the table gives."""
+    noise = settings.noise
+    information = np.zeros((3, 3))
+    lengths = []
+    for path in paths:
+        if not path.heard[place]:
+            continue
+        length, horizontal, vertical = path.gradients[place]
+        across = max(float(np.sin(path.zenith[place])), 1e-6) * noise.azimuth_stdev
+        information += np.outer(horizontal, horizontal) / across**2
+        information += np.outer(vertical, vertical) / noise.zenith_stdev**2
+        lengths.append(length)
+    return information_bound(information, lengths, noise, timing=settings.timing)
+
+
+def _outlook(locator: Locator, measurements: tuple[Measurement, ...], threshold: float) -> tuple[float, float]:
+    """Mean square error [m2] and probability of one below the threshold [m], as the posterior of a report says."""
+    regions = locator.locate(Report(measurements=measurements)).regions if measurements else None
+    if regions is None:
+        return float("inf"), 0.0
+    square = np.square(regions.points.places() - regions.position).sum(axis=1)
+    return float(square.mean()), regions.share * float(np.mean(square < threshold**2))
+
+
+def _measure(
+    stations: Sequence[Station], paths: Sequence[HeardPaths], place: int, settings: PlanSettings, errors: Array
+) -> tuple[Measurement, ...]:
+    """Measurements from a place; ``errors`` in standard deviations, of shape (n_stations, 3)."""
+    noise, timing = settings.noise, settings.timing
+    range_stdev = noise.range_stdev or 0.0
+    measurements: list[Measurement] = []
+    arrivals: list[tuple[str, float]] = []
+    for station, path, error in zip(stations, paths, errors, strict=True):
+        if not path.heard[place]:
+            continue
+        azimuth, zenith = fold_direction(
+            path.azimuth[place] + station.bias.azimuth + error[0] * noise.azimuth_stdev,
+            path.zenith[place] + station.bias.zenith + error[1] * noise.zenith_stdev,
+        )
+        measurements.append(
+            Angle(
+                station_id=station.id,
+                azimuth=azimuth,
+                zenith=zenith,
+                azimuth_stdev=noise.azimuth_stdev,
+                zenith_stdev=noise.zenith_stdev,
+            )
+        )
+        arrivals.append((station.id, float(path.path_length[place] + station.bias.range + error[2] * range_stdev)))
+    if timing == "pt":
+        measurements += [Range(station_id=name, path_length=length, stdev=range_stdev) for name, length in arrivals]
+    if timing == "toa":
+        measurements += [
+            TimeOfArrival(station_id=name, path_length=length + _CLOCK, stdev=range_stdev) for name, length in arrivals
+        ]
+    if timing == "tdoa":
+        reference, start = arrivals[0] if arrivals else ("", 0.0)
+        measurements += [
+            TimeDifference(
+                station_id=name,
+                reference_station_id=reference,
+                length_difference=length - start,
+                stdev=float(np.sqrt(2.0)) * range_stdev,
+            )
+            for name, length in arrivals[1:]
+        ]
+    return tuple(measurements)
+
+
+def summary(plan: PlanMap) -> dict[str, Any]:
+    """Figures of a map, JSON-compatible; None where a figure is infinite."""
+    expected = np.quantile(plan.error, [0.5, 0.9], method="inverted_cdf")
+    return {
+        "table_id": plan.table_id,
+        "squares": len(plan),
+        "coverage": plan.coverage,
+        "error_m": {"50": finite(expected[0]), "90": finite(expected[1])},
+        "stations_heard": {
+            "mean": float(plan.num_heard.mean()),
+            "share_below_2": float(np.mean(plan.num_heard < 2.0)),
+        },
+    }
+
+
+def finite(value: float) -> float | None:
+    """Give a number as JSON can hold it: None for what is infinite."""
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,244 @@
+"""A case: what the world is like, what is measured in it and how well, and what is wrong with it."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_evaluation.drops.accuracy import Drop
+from rayfix_evaluation.drops.bound import position_error_bound
+from rayfix_evaluation.drops.simulate import Noise, Rule, Timing, fold_direction, select_path, simulate_report
+from rayfix_evaluation.drops.stress import (
+    Document,
+    with_late_time,
+    with_random_angle,
+    with_scaled_stdevs,
+    with_turned_stations,
+)
+from rayfix_evaluation.truth.forward import Paths
+from rayfix_tables.angles import direction, local_to_scene
+from rayfix_tables.site import Station
+
+__all__ = ["Case", "Simulated", "World", "document_key", "in_view", "simulate_case"]
+
+# What a generator is for; the seed comes first and the number of the drop last.
+_NOISE, _TURN, _SELECT, _BLOCK, _ORDER, _BIAS, _SPOIL = 1, 2, 4, 5, 6, 7, 8
+
+_DELAY = 10.0
+"""How late a late time is, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """How the building differs from its twin.
+
+    Attributes
+    ----------
+    objects, walls : float, m
+        How far objects and outer walls are from where the twin has them.
+    more_reflections : int
+        Reflections of the longest paths beyond those in the table.
+    """
+
+    objects: float = 0.0
+    walls: float = 0.0
+    more_reflections: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """Settings of a run.
+
+    Attributes
+    ----------
+    angle_deg : float, deg
+        Standard deviation of azimuth and zenith.
+    timing : {"none", "pt", "toa", "tdoa"}
+        Times besides the angles. ``"tdoa"`` gives the paper's relative propagation times (RPT).
+    range_stdev : float, m
+        Standard deviation of a time as a length; of a difference, where differences are measured.
+    rule : {"strongest", "first", "random"}
+        Which path each station reports.
+    world : World
+    heard : int or None
+        Stations that are left in the report, drawn anew for each drop; None for all.
+    without : str or None
+        A station that is out of service.
+    blocked : float
+        Probability with which the direct path of a station is blocked.
+    told : float
+        Standard deviations in the report over the true ones.
+    bias_deg : float, deg
+        Offset of a station's azimuth and zenith, with signs that are drawn once for each station.
+    turned_deg : float, deg
+        Angle by which stations are turned about axes drawn anew for each drop.
+    random_angles : int
+        Stations whose angle has nothing to do with the transmitter.
+    late_times : int
+        Stations whose time is 10 m late.
+    """
+
+    angle_deg: float = 1.0
+    timing: Timing = "pt"
+    range_stdev: float = 0.5
+    rule: Rule = "strongest"
+    world: World = World()
+    heard: int | None = None
+    without: str | None = None
+    blocked: float = 0.0
+    told: float = 1.0
+    bias_deg: float = 0.0
+    turned_deg: float = 0.0
+    random_angles: int = 0
+    late_times: int = 0
+
+    @property
+    def noise(self) -> Noise:
+        """True deviations of the measurements."""
+        angle = float(np.deg2rad(self.angle_deg))
+        # A difference has the noise of both of its times.
+        single = self.range_stdev / np.sqrt(2.0) if self.timing == "tdoa" else self.range_stdev
+        return Noise(azimuth_stdev=angle, zenith_stdev=angle, range_stdev=float(single))
+
+    def document(self) -> dict[str, Any]:
+        """Return the settings as JSON-compatible data."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulated:
+    """A report and what is true of it.
+
+    Attributes
+    ----------
+    report : dict
+        Body of ``POST /v1/positions``; without measurements where no station is left.
+    bound : float, m
+        Position error bound of what was measured before anything was spoilt.
+    hidden : int
+        Stations in the report whose path is reflected.
+    """
+
+    report: Document
+    bound: float
+    hidden: int
+
+
+def document_key(document: Mapping[str, Any]) -> str:
+    """Return a name for settings: equal for equal ones only."""
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def simulate_case(case: Case, drop: Drop, number: int, stations: Sequence[Station], seed: int) -> Simulated:
+    """Simulate the report of a drop.
+
+    With one seed, the same number has the same standardised noise in all cases.
+
+    Parameters
+    ----------
+    drop : Drop
+        With all paths of its world.
+    number : int
+        Of the drop.
+    stations : sequence of Station
+        Of the site.
+    """
+
+    def generator(purpose: int) -> np.random.Generator:
+        return np.random.default_rng([seed, purpose, number])
+
+    reported = _reported(case, drop, generator(_BLOCK), generator(_SELECT))
+    report = simulate_report(reported, case.noise, rng=generator(_NOISE), timing=case.timing)
+    order = [list(reported)[n] for n in generator(_ORDER).permutation(len(reported))]
+    silent = set(order[case.heard :] if case.heard is not None else []) | {case.without}
+    if silent & set(reported):
+        reported = {name: paths for name, paths in reported.items() if name not in silent}
+        report["measurements"] = [m for m in report["measurements"] if m["station_id"] not in silent]
+    where = {station.id: station.position for station in stations}
+    bound = position_error_bound(
+        np.array([where[name] for name in reported]).reshape(-1, 3),
+        list(reported.values()),
+        [0] * len(reported),
+        drop.position,
+        case.noise,
+        timing=case.timing,
+    )
+    return Simulated(
+        report=_spoil(case, report, list(reported), stations, seed, number),
+        bound=bound,
+        hidden=sum(int(paths.num_reflections[0] > 0) for paths in reported.values()),
+    )
+
+
+def in_view(station: Station, paths: Paths) -> Paths:
+    """Those paths that come from within a station's field of view."""
+    axis = local_to_scene(station.orientation)[:, 0]
+    cosine = np.clip(direction(paths.azimuth, paths.zenith) @ axis, -1.0, 1.0)
+    return _subset(paths, np.flatnonzero(np.arccos(cosine) <= 0.5 * station.field_of_view))
+
+
+def _reported(
+    case: Case, drop: Drop, block_rng: np.random.Generator, select_rng: np.random.Generator
+) -> dict[str, Paths]:
+    """Path that each station reports, of those that are not blocked."""
+    reported = {}
+    for name, paths in drop.paths.items():
+        blocked = bool(block_rng.random() < case.blocked)
+        left = np.flatnonzero(paths.num_reflections > 0) if blocked else np.arange(len(paths))
+        if len(left):
+            usable = _subset(paths, left)
+            reported[name] = usable.only(select_path(usable, case.rule, select_rng))
+    return reported
+
+
+def _subset(paths: Paths, index: NDArray[np.int64]) -> Paths:
+    return Paths(
+        path_length=paths.path_length[index],
+        azimuth=paths.azimuth[index],
+        zenith=paths.zenith[index],
+        num_reflections=paths.num_reflections[index],
+        gain_db=paths.gain_db[index],
+        vertices=paths.vertices[index],
+    )
+
+
+def _spoil(
+    case: Case, report: Document, names: Sequence[str], stations: Sequence[Station], seed: int, number: int
+) -> Document:
+    rng = np.random.default_rng([seed, _SPOIL, number])
+    order = [names[n] for n in rng.permutation(len(names))]
+    for name in order[: case.random_angles]:
+        report = with_random_angle(report, name, rng)
+    for name in order[: case.late_times]:
+        report = with_late_time(report, name, _DELAY)
+    if case.turned_deg:
+        turn = np.random.default_rng([seed, _TURN, number])
+        report = with_turned_stations(report, float(np.deg2rad(case.turned_deg)), turn)
+    # What the site file says that a station measures wrongly, it does; the fusion takes it off again.
+    offsets = {s.id: np.degrees([s.bias.azimuth, s.bias.zenith]) for s in stations}
+    if case.bias_deg:
+        signs = np.random.default_rng([seed, _BIAS]).choice([-1.0, 1.0], (len(stations), 2))
+        offsets = {name: off + case.bias_deg * sign for (name, off), sign in zip(offsets.items(), signs, strict=True)}
+    if any(off.any() for off in offsets.values()):
+        report = _with_bias(report, offsets)
+    for station in stations:
+        if station.bias.range:
+            report = with_late_time(report, station.id, station.bias.range)
+    return with_scaled_stdevs(report, case.told) if case.told != 1.0 else report
+
+
+def _with_bias(report: Document, offsets: Mapping[str, NDArray[np.float64]]) -> Document:
+    """Copy a report with azimuths and zeniths off by an offset [deg] of each station's own."""
+    measurements = []
+    for m in report["measurements"]:
+        if m["type"] == "aoa":
+            off = offsets[m["station_id"]]
+            azimuth, zenith = fold_direction(*np.deg2rad([m["azimuth_deg"] + off[0], m["zenith_deg"] + off[1]]))
+            m = {**m, "azimuth_deg": float(np.degrees(azimuth)), "zenith_deg": float(np.degrees(zenith))}
+        measurements.append(m)
+    return {**report, "measurements": measurements}

@@ -1,0 +1,283 @@
+"""The methods that are compared, in one registry.
+
+A method is made once for each process from its :class:`Tools` and then answers questions. What it cannot answer, a
+position being undetermined or a measurement unknown to it, it answers with no position.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_evaluation.baselines.fingerprints import Fingerprinting, RadioMap
+from rayfix_evaluation.baselines.line_of_sight import Kind, LineOfSight
+from rayfix_evaluation.baselines.planar import PlanarPredecessor
+from rayfix_evaluation.baselines.reverse_rays import ReverseRays
+from rayfix_evaluation.drops.calibration import ellipsoid_holds
+from rayfix_evaluation.drops.simulate import Timing
+from rayfix_evaluation.paper.locate import PaperLocator
+from rayfix_evaluation.studies.plain_mixtures import PlainTableLocator
+from rayfix_evaluation.studies.summary import COVERAGE
+from rayfix_service.fusion.locator import Locator
+from rayfix_service.fusion.measurements.report import Height, Report
+from rayfix_tables.table import Table
+
+__all__ = ["METHODS", "Answer", "Method", "Question", "Tools"]
+
+_STRAIGHT: tuple[tuple[Kind, str, frozenset[Timing]], ...] = (
+    ("angles", "angles", frozenset(["none", "pt", "toa", "tdoa"])),
+    ("ranges", "ranges", frozenset(["pt"])),
+    ("differences", "time differences", frozenset(["toa", "tdoa"])),
+)
+
+_ANY: frozenset[Timing] = frozenset(["none", "pt", "toa", "tdoa"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """A report to locate.
+
+    Attributes
+    ----------
+    truth : ndarray of shape (3,), m
+        True position, of which a method may look at what it is said to know.
+    """
+
+    report: Report
+    truth: NDArray[np.float64]
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """What a method says.
+
+    Attributes
+    ----------
+    position : ndarray of shape (3,), m, or None
+    covered : tuple of bool or None
+        Whether the ellipsoids of ``COVERAGE`` hold the truth; None without a stated uncertainty.
+    """
+
+    position: NDArray[np.float64] | None
+    covered: tuple[bool, ...] | None = None
+
+
+Answering = Callable[[Question], Answer]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tools:
+    """What methods are made of.
+
+    Attributes
+    ----------
+    tables : mapping of str to Path
+        Tables by their variant; ``"site"`` is that of the site itself.
+    radio_map : RadioMap or None
+        Of the fingerprints; it takes longer to make than all answers, so that it is made once for all processes.
+    """
+
+    tables: Mapping[str, Path]
+    radio_map: RadioMap | None = None
+
+    def table(self, variant: str) -> Table:
+        """Open a variant of the table."""
+        return Table.open(self.tables[variant])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """One method.
+
+    Attributes
+    ----------
+    key, label : str
+        In files and for people.
+    note : str
+        One sentence on what it does and knows.
+    variant : str
+        Which table it needs.
+    timings : frozenset of str
+        Times besides angles with which it can do something.
+    calibrated : bool
+        Whether it states an uncertainty that can be checked.
+    weight : float
+        About how many times as long it takes as rayfix, for the progress bar.
+    needs_map : bool
+        Whether it needs the map of fingerprints.
+    compared : bool
+        Whether it is one of those side by side, and not there for a single study.
+    make : callable
+        From tools to what answers.
+    """
+
+    key: str
+    label: str
+    note: str
+    variant: str = "site"
+    timings: frozenset[Timing] = _ANY
+    calibrated: bool = False
+    weight: float = 1.0
+    needs_map: bool = False
+    compared: bool = True
+    make: Callable[[Tools], Answering]
+
+
+def _rayfix(variant: str) -> Callable[[Tools], Answering]:
+    def make(tools: Tools) -> Answering:
+        locator = Locator(tools.table(variant))
+        locator.warm_up()
+
+        def answer(question: Question) -> Answer:
+            fix = locator.locate(question.report)
+            if fix.position is None:
+                return Answer(position=None)
+            return Answer(
+                position=fix.position,
+                covered=tuple(ellipsoid_holds(fix, p, question.truth) for p in COVERAGE),
+            )
+
+        return answer
+
+    return make
+
+
+def _paper(tools: Tools) -> Answering:
+    locator = PaperLocator.of_table(tools.table("site"))
+    return lambda question: Answer(position=locator.locate(question.report, question.rng))
+
+
+def _paper_table(tools: Tools) -> Answering:
+    locator = PlainTableLocator(table=tools.table("paper"))
+    return lambda question: Answer(position=locator.locate(question.report))
+
+
+def _planar(tools: Tools) -> Answering:
+    locator = PlanarPredecessor.of_table(tools.table("site"))
+
+    def answer(question: Question) -> Answer:
+        height = Height(z=float(question.truth[2]), stdev=0.01)
+        return Answer(position=locator.locate(replace(question.report, height=height)))
+
+    return answer
+
+
+def _reverse_rays(tools: Tools) -> Answering:
+    locator = ReverseRays.of_table(tools.table("site"))
+    return lambda question: Answer(position=locator.locate(question.report))
+
+
+def _line_of_sight(kind: Kind) -> Callable[[Tools], Answering]:
+    def make(tools: Tools) -> Answering:
+        table = tools.table("site")
+        vertices = np.asarray(table.scene.vertices, np.float64)
+        bounds = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
+        locator = LineOfSight(site=table.site, bounds=bounds, kinds=(kind,))
+        return lambda question: Answer(position=locator.locate(question.report))
+
+    return make
+
+
+def _fingerprints(tools: Tools) -> Answering:
+    assert tools.radio_map is not None
+    locator = Fingerprinting(site=tools.table("site").site, radio_map=tools.radio_map)
+    return lambda question: Answer(position=locator.locate(question.report))
+
+
+_OURS = (
+    Method(
+        key="rayfix",
+        label="rayfix",
+        note="The table of the site file: s^2 and the path-selection prior, closed-form conditioning on angles and "
+        "times, outliers, free space.",
+        calibrated=True,
+        make=_rayfix("site"),
+    ),
+    Method(
+        key="rayfix-uniform",
+        label="rayfix, uniform prior",
+        note="The same with a table without the path-selection prior: any path of a place is as likely as another.",
+        variant="uniform",
+        calibrated=True,
+        make=_rayfix("uniform"),
+    ),
+    Method(
+        key="rayfix-paper",
+        label="rayfix, paper's prior",
+        note="The same with a table that weighs points along a ray alike, as the paper does.",
+        variant="paper",
+        calibrated=True,
+        make=_rayfix("paper"),
+    ),
+    Method(
+        key="paper",
+        label="paper's method, online",
+        note="Rays launched for each report, Algorithm 1 or 2, EM, product, arg max.",
+        weight=50.0,
+        make=_paper,
+    ),
+    Method(
+        key="paper-table",
+        label="paper's method, plain table",
+        note="Mixtures of the nearest cells, no correction for the angle within a cell, product, arg max.",
+        variant="paper",
+        timings=frozenset(["none", "pt"]),
+        weight=10.0,
+        make=_paper_table,
+    ),
+)
+
+_RIVALS = (
+    Method(
+        key="planar",
+        label="2D predecessor, true height",
+        note="Rays of the angles cross the plane of the transmitter's height, which it is told exactly; 2D mixtures, "
+        "product. Times are left.",
+        weight=10.0,
+        make=_planar,
+    ),
+    Method(
+        key="reverse-rays",
+        label="noise-free reverse rays",
+        note="One mirrored ray for each measured angle; where they meet. Times are left.",
+        weight=3.0,
+        make=_reverse_rays,
+    ),
+    *(
+        Method(
+            key=f"los-{kind}",
+            label=f"least squares on {text}",
+            note=f"Weighted least squares on {text} as if every path were the line of sight.",
+            timings=timings,
+            weight=5.0,
+            make=_line_of_sight(kind),
+        )
+        for kind, text, timings in _STRAIGHT
+    ),
+    Method(
+        key="fingerprints",
+        label="k-NN fingerprints",
+        note="The places of a simulated map whose strongest paths are most like the report.",
+        needs_map=True,
+        make=_fingerprints,
+    ),
+)
+
+_FEWER = tuple(
+    Method(
+        key=f"rayfix-fewer-{n}",
+        label=f"rayfix, {n} fewer reflections",
+        note=f"With a table that follows rays over {n} reflections fewer than the site file says.",
+        variant=f"fewer-{n}",
+        calibrated=True,
+        compared=False,
+        make=_rayfix(f"fewer-{n}"),
+    )
+    for n in (1, 2, 3)
+)
+
+METHODS: dict[str, Method] = {method.key: method for method in (*_OURS, *_RIVALS, *_FEWER)}
+"""All methods by key."""

@@ -1,0 +1,116 @@
+"""Results on disk: whatever is finished is kept, and a run that finds it does not do it again."""
+
+import ast
+import hashlib
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import rayfix_evaluation
+import rayfix_offline
+import rayfix_service
+import rayfix_tables
+from rayfix_evaluation.studies.cases import document_key
+from rayfix_tables.errors import RayfixError
+
+__all__ = ["Store", "code_digest", "write_json"]
+
+_NOT_NUMERIC = ("report", "pictures", "http", "server", "web", "adapters", "__pycache__")
+"""Folders whose code does not change a number."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Store:
+    """A folder of finished results, each named by the settings that it came from."""
+
+    folder: Path
+
+    def get(self, settings: Mapping[str, Any]) -> Any | None:
+        """Return what is stored for settings, or None. A file that is not whole counts as missing."""
+        try:
+            entry = json.loads(self._path(settings).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        return entry["content"] if isinstance(entry, dict) and entry.get("settings") == _plain(settings) else None
+
+    def put(self, settings: Mapping[str, Any], content: Any) -> None:
+        """Store what settings gave.
+
+        Raises
+        ------
+        RayfixError
+            When the folder cannot be written.
+        """
+        write_json(self._path(settings), {"settings": settings, "content": content}, indent=None)
+
+    def _path(self, settings: Mapping[str, Any]) -> Path:
+        return self.folder / f"{document_key(settings)}.json"
+
+
+def write_json(path: Path, document: Any, *, indent: int | None = 1) -> None:
+    """Write a document beside its place and rename it.
+
+    Raises
+    ------
+    RayfixError
+        When it cannot be written.
+    """
+    text = json.dumps(document, indent=indent, allow_nan=False)
+    # Rows of numbers on one line each, or a page of results has a hundred thousand lines.
+    text = re.sub(r"\[\s+([^\[\]{}\"]+?)\s+\]", lambda row: "[" + re.sub(r"\s+", " ", row[1]) + "]", text)
+    write_text(path, text + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text beside its place and rename it.
+
+    Raises
+    ------
+    RayfixError
+        When it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f".{path.name}.{os.getpid()}")
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise RayfixError(f"cannot write {path}: {error.strerror}; choose another folder with -o") from error
+
+
+@cache
+def code_digest() -> str:
+    """Return a checksum of the code that numbers come from: results of other code are not its own.
+
+    Comments, docstrings and layout do not count.
+    """
+    digest = hashlib.sha256()
+    for package in (rayfix_tables, rayfix_offline, rayfix_service, rayfix_evaluation):
+        root = Path(str(package.__file__)).parent
+        for path in sorted(root.rglob("*.py")):
+            parts = path.relative_to(root).parts
+            if not any(part in _NOT_NUMERIC for part in parts):
+                digest.update("/".join(parts).encode() + b"\0" + meaning(path.read_text(encoding="utf-8")) + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def meaning(source: str) -> bytes:
+    """Return what a module's source does, without its comments, docstrings and layout."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            node.body = [
+                statement
+                for statement in node.body
+                if not (isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant))
+            ]
+    return ast.dump(tree).encode()
+
+
+def _plain(document: Any) -> Any:
+    return json.loads(json.dumps(document))

@@ -1,0 +1,286 @@
+"""Ground truth: every specular path between a station and a point (image method with visibility).
+
+Shares no code with the ray launcher, so that each can be tested against the other. Angles, lengths and frames
+are those of ``docs/conventions.md``.
+
+A path leaves the station, is mirrored at up to ``max_reflections`` planes and ends at the point. Coplanar
+triangles are one mirror; it reflects on both sides, but only where a triangle is. A path exists when every
+bounce hits a triangle of its plane, the vertices before and after the bounce lie on the same side of it, and
+no triangle crosses a segment between its ends.
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rayfix_evaluation.truth.forward_kernels import hit_triangles, trace_paths, visible
+from rayfix_evaluation.truth.fresnel import reflection_gain_db
+from rayfix_evaluation.truth.images import image_tree, mirror_scene
+from rayfix_evaluation.truth.mirrors import ImageTree, MirrorScene
+
+__all__ = ["ForwardSolver", "Paths", "StationSolver"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Paths:
+    """All paths between one station and one point, sorted by descending gain.
+
+    Attributes
+    ----------
+    path_length : ndarray of shape (n_paths,), m
+        Unfolded lengths.
+    azimuth : ndarray of shape (n_paths,), rad
+        Azimuth of the direction from the station along the path's first segment, in (-pi, pi].
+    zenith : ndarray of shape (n_paths,), rad
+        Zenith of the same direction, in [0, pi].
+    num_reflections : ndarray of int of shape (n_paths,)
+        Number of bounces; 0 is the line of sight.
+    gain_db : ndarray of shape (n_paths,), dB
+        Power gain relative to one metre of free space: ``-20 log10(path_length)`` less the loss of the
+        bounces.
+    vertices : ndarray of shape (n_paths, max_reflections + 2, 3), m
+        Station, reflection points, point; unused rows repeat the point.
+    """
+
+    path_length: NDArray[np.float64]
+    azimuth: NDArray[np.float64]
+    zenith: NDArray[np.float64]
+    num_reflections: NDArray[np.int64]
+    gain_db: NDArray[np.float64]
+    vertices: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """Return the number of paths."""
+        return len(self.path_length)
+
+    def only(self, index: int) -> "Paths":
+        """Leave one path, as a set of its own."""
+        return Paths(**{field.name: getattr(self, field.name)[index : index + 1] for field in fields(self)})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ForwardSolver:
+    """Finds the paths in one scene; build it with :meth:`from_mesh`.
+
+    Attributes
+    ----------
+    scene : MirrorScene
+        Mirror planes and triangles.
+    max_reflections : int
+        Largest number of reflections of a path.
+    max_path_length : float
+        Largest length of a path, m.
+    reflection_loss_db : float
+        Loss of each bounce, dB.
+    triangle_permittivity : ndarray of complex of shape (n_triangles,) or None
+        Complex relative permittivity of the scene's triangles; NaN where each bounce has the constant loss, and
+        None where all have it.
+    """
+
+    scene: MirrorScene
+    max_reflections: int
+    max_path_length: float
+    reflection_loss_db: float
+    triangle_permittivity: NDArray[np.complex128] | None = None
+
+    @classmethod
+    def from_mesh(
+        cls,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        *,
+        max_reflections: int = 3,
+        max_path_length: float = 60.0,
+        reflection_loss_db: float = 6.0,
+        face_permittivity: ArrayLike | None = None,
+    ) -> "ForwardSolver":
+        """Merge a mesh's coplanar triangles into mirrors and prepare the visibility tests.
+
+        Parameters
+        ----------
+        vertices : ndarray of shape (n_vertices, 3), m
+            Vertices of the mesh.
+        faces : ndarray of int of shape (n_faces, 3)
+            Vertex indices of the triangles, in any order and orientation.
+        max_reflections : int
+            Largest number of reflections of a path.
+        max_path_length : float
+            Largest length of a path, m.
+        reflection_loss_db : float
+            Loss of each bounce, dB.
+        face_permittivity : ndarray of complex of shape (n_faces,), optional
+            Complex relative permittivity of the triangles, which then reflect as half spaces; NaN for those that
+            have the constant loss.
+
+        Returns
+        -------
+        ForwardSolver
+            The solver of this scene.
+
+        Raises
+        ------
+        SceneError
+            If the mesh has no triangle with an area or a vertex that is not finite.
+        ValueError
+            If a setting is out of range.
+        """
+        if max_reflections < 0:
+            raise ValueError(f"max_reflections is {max_reflections}; it must not be negative")
+        if not max_path_length > 0.0:
+            raise ValueError(f"max_path_length is {max_path_length} m; it must be positive")
+        scene = mirror_scene(np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64))
+        permittivity = None
+        if face_permittivity is not None:
+            permittivity = np.asarray(face_permittivity, dtype=np.complex128)
+            if permittivity.shape != (len(np.asarray(faces)),):
+                raise ValueError(
+                    f"face_permittivity has the shape {permittivity.shape}; it must have one value for each of the "
+                    f"{len(np.asarray(faces))} faces"
+                )
+            permittivity = permittivity[scene.triangle_faces]
+        return cls(
+            scene=scene,
+            max_reflections=max_reflections,
+            # An int would compile the kernels a second time.
+            max_path_length=float(max_path_length),
+            reflection_loss_db=float(reflection_loss_db),
+            triangle_permittivity=permittivity,
+        )
+
+    @property
+    def num_planes(self) -> int:
+        """Number of mirror planes."""
+        return len(self.scene.normals)
+
+    def station(self, position: ArrayLike) -> "StationSolver":
+        """Build the image sources of a station once, for many points.
+
+        Parameters
+        ----------
+        position : ndarray of shape (3,), m
+            Position of the station.
+
+        Returns
+        -------
+        StationSolver
+            Solver of this station's paths.
+        """
+        origin = _position(position, "station")
+        tree = image_tree(
+            self.scene, origin, max_reflections=self.max_reflections, max_path_length=self.max_path_length
+        )
+        return StationSolver(solver=self, position=origin, tree=tree)
+
+    def paths(self, station: ArrayLike, point: ArrayLike) -> Paths:
+        """Find all paths between a station and a point; :meth:`station` is faster for many points.
+
+        Parameters
+        ----------
+        station : ndarray of shape (3,), m
+            Position of the station.
+        point : ndarray of shape (3,), m
+            Position of the transmitter.
+
+        Returns
+        -------
+        Paths
+            Sorted by descending gain; empty if there is none.
+        """
+        return self.station(station).paths(point)
+
+    def line_of_sight(self, station: ArrayLike, points: ArrayLike) -> NDArray[np.bool_]:
+        """Tell which points nothing hides from a station, whatever their distance.
+
+        Parameters
+        ----------
+        station : ndarray of shape (3,), m
+            Position of the station.
+        points : ndarray of shape (n, 3), m
+            Positions to test.
+
+        Returns
+        -------
+        ndarray of bool of shape (n,)
+            True where no triangle crosses the straight line.
+        """
+        ends = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+        seen: NDArray[np.bool_] = visible(self.scene, _position(station, "station"), ends)
+        return seen
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StationSolver:
+    """Finds the paths of one station; build it with :meth:`ForwardSolver.station`.
+
+    Attributes
+    ----------
+    solver : ForwardSolver
+        Scene and settings.
+    position : ndarray of shape (3,), m
+        Position of the station.
+    tree : ImageTree
+        Its image sources.
+    """
+
+    solver: ForwardSolver
+    position: NDArray[np.float64]
+    tree: ImageTree
+
+    def paths(self, point: ArrayLike) -> Paths:
+        """Find all paths between the station and a point.
+
+        Parameters
+        ----------
+        point : ndarray of shape (3,), m
+            Position of the transmitter.
+
+        Returns
+        -------
+        Paths
+            Sorted by descending gain; empty if there is none. A point within a micrometre of the station has
+            no direct path, since that would have no direction.
+        """
+        solver = self.solver
+        end = _position(point, "point")
+        sequences, vertices, unfolded = trace_paths(
+            solver.scene, self.tree, end, solver.max_reflections, solver.max_path_length
+        )
+        offset = unfolded - self.position
+        horizontal = np.hypot(offset[:, 0], offset[:, 1])
+        length = np.hypot(horizontal, offset[:, 2])
+        num_reflections = (sequences >= 0).sum(axis=1)
+        gain = -20.0 * np.log10(length) + self._reflection_gain_db(sequences, vertices)
+        azimuth = np.arctan2(offset[:, 1], offset[:, 0])
+        azimuth[azimuth <= -np.pi] = np.pi  # arctan2 of -0.0
+        order = np.argsort(-gain, kind="stable")
+        return Paths(
+            path_length=length[order],
+            azimuth=azimuth[order],
+            zenith=np.arctan2(horizontal, offset[:, 2])[order],
+            num_reflections=num_reflections[order],
+            gain_db=gain[order],
+            vertices=vertices[order],
+        )
+
+    def _reflection_gain_db(self, sequences: NDArray[np.int64], vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum of the gains of each path's bounces, shape (n_paths,), dB."""
+        solver = self.solver
+        gain = np.where(sequences >= 0, -solver.reflection_loss_db, 0.0)
+        if solver.triangle_permittivity is not None:
+            triangles = hit_triangles(solver.scene, sequences, vertices)
+            permittivity = np.where(triangles >= 0, solver.triangle_permittivity[triangles], np.nan)
+            path, bounce = np.nonzero(np.isfinite(permittivity))
+            step = vertices[path, bounce + 1] - vertices[path, bounce]
+            normals = solver.scene.normals[sequences[path, bounce]]
+            cosine = np.abs(np.einsum("ij,ij->i", step, normals)) / np.linalg.norm(step, axis=1)
+            gain[path, bounce] = reflection_gain_db(np.minimum(cosine, 1.0), permittivity[path, bounce])
+        return np.asarray(gain.sum(axis=1))
+
+
+def _position(position: ArrayLike, name: str) -> NDArray[np.float64]:
+    """Check a position and return it as an array of shape (3,)."""
+    array = np.array(position, dtype=np.float64)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise ValueError(f"the {name} is {position!r}; it must be three finite coordinates in metres")
+    return array

@@ -1,0 +1,1 @@
+"""Gaussian mixtures of the cells, fitted to pieces of rays."""

@@ -1,0 +1,140 @@
+"""Cells that have been fitted: the result of a block, and what becomes of blocks in a shard and in a level."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.fit.em import ExpectationMaximisation, fit_em
+from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.fit.wide_windows import CoarseFit, sum_cells
+from rayfix_offline.rays.trace import LevelRays
+from rayfix_offline.site import SiteFile
+from rayfix_tables.grid import AngularGrid
+from rayfix_tables.level import Level
+from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedCells:
+    """Fitted cells of a block.
+
+    Attributes
+    ----------
+    cells : ndarray of int64, shape (n_cells,)
+    counts : ndarray of int64, shape (n_cells,)
+        Components of each cell.
+    log_mass : ndarray of shape (n_cells,)
+    change : ndarray of float32, shape (n_cells,)
+        Bound on the change of the cell's measure since it was fitted, as a share of its mass; 0: fitted to this scene.
+    mixture : TubeMixture
+        Components of all cells.
+    """
+
+    cells: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    log_mass: NDArray[np.float64]
+    change: NDArray[np.float32]
+    mixture: TubeMixture
+
+    @classmethod
+    def of_level(cls, level: Level, cells: NDArray[np.int64], change: NDArray[np.float64]) -> "FittedCells":
+        """Take cells out of a level."""
+        counts = level.cell_offsets[cells + 1] - level.cell_offsets[cells]
+        return cls(
+            cells=cells,
+            counts=counts,
+            log_mass=level.cell_log_mass[cells],
+            change=change.astype(np.float32),
+            mixture=level.mixture[_places(level.cell_offsets[cells], counts)],
+        )
+
+    def joined(self, other: "FittedCells") -> "FittedCells":
+        """Return the cells of both, in ascending order."""
+        cells = np.concatenate([self.cells, other.cells])
+        order = np.argsort(cells)
+        counts = np.concatenate([self.counts, other.counts])
+        starts = np.cumsum(counts) - counts
+        mixture = TubeMixture.concatenate([self.mixture, other.mixture])
+        return FittedCells(
+            cells=cells[order],
+            counts=counts[order],
+            log_mass=np.concatenate([self.log_mass, other.log_mass])[order],
+            change=np.concatenate([self.change, other.change])[order],
+            mixture=mixture[_places(starts[order], counts[order])],
+        )
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a shard."""
+        fields = {name: getattr(self.mixture, name) for name in FIELD_SHAPES}
+        return {"cells": self.cells, "counts": self.counts, "log_mass": self.log_mass, "change": self.change, **fields}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> "FittedCells":
+        """Take up what :meth:`to_arrays` gave."""
+        mixture = TubeMixture(**{name: arrays[name] for name in FIELD_SHAPES})
+        columns = {name: arrays[name] for name in ("cells", "counts", "log_mass", "change")}
+        return cls(**columns, mixture=mixture)
+
+
+def _places(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Numbers from each start on, as many as its count, one after another."""
+    ends = np.cumsum(counts)
+    return np.repeat(starts - (ends - counts), counts) + np.arange(counts.sum())
+
+
+def fit_cells(cells: NDArray[np.int64], level: LevelRays, site: SiteFile) -> FittedCells:
+    """Fit cells of a level in the way that the site asks for."""
+    centres = level.grid.centres[cells]
+    if site.table.fit == "em":
+        counts, log_mass, mixture = fit_em(centres, cells, level, ExpectationMaximisation(seed=site.table.seed))
+    else:
+        counts, log_mass, mixture = fit_tubes(centres, level, TubeFit())
+    change = np.zeros(len(cells), np.float32)
+    return FittedCells(cells=cells, counts=counts, log_mass=log_mass, change=change, mixture=mixture)
+
+
+def widen_cells(
+    cells: NDArray[np.int64], window: float, grid: AngularGrid, finer: Level, finer_change: NDArray[np.float32]
+) -> FittedCells:
+    """Make cells of a wide window [rad] from those of the next finer level; see :func:`sum_cells`."""
+    summed = sum_cells(grid.centres[cells], window, finer, finer_change, CoarseFit())
+    return FittedCells(
+        cells=cells,
+        counts=summed.counts,
+        log_mass=summed.log_mass,
+        change=summed.change.astype(np.float32),
+        mixture=summed.mixture,
+    )
+
+
+def assemble_level(window: float, grid: AngularGrid, parts: Sequence[FittedCells]) -> Level:
+    """Put the blocks of a level together.
+
+    Parameters
+    ----------
+    window : float, rad
+    parts : sequence of FittedCells
+        In the order of their cells; cells that are in none stay empty.
+    """
+    counts = np.zeros(grid.num_cells, np.int64)
+    log_mass = np.full(grid.num_cells, -np.inf)
+    for part in parts:
+        counts[part.cells], log_mass[part.cells] = part.counts, part.log_mass
+    return Level(
+        window=window,
+        grid=grid,
+        cell_offsets=np.concatenate([[0], np.cumsum(counts)]),
+        cell_log_mass=log_mass,
+        mixture=TubeMixture.concatenate([part.mixture for part in parts]),
+    )
+
+
+def assemble_changes(grid: AngularGrid, parts: Sequence[FittedCells]) -> NDArray[np.float32]:
+    """Put the changes of all cells of a level together, shape (n_cells,); 0 for cells that are in no part."""
+    change = np.zeros(grid.num_cells, np.float32)
+    for part in parts:
+        change[part.cells] = part.change
+    return change

@@ -1,0 +1,152 @@
+"""``fit = "em"``: cells fitted by expectation-maximisation on sampled points, as in the paper.
+
+Points are drawn from a cell's weighted ray pieces and a full-covariance Gaussian mixture is fitted to them jointly over
+(path length, angles, position); the number of components is the one with the least BIC.
+"""
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.mixture import GaussianMixture
+from threadpoolctl import threadpool_limits
+
+from rayfix_offline.fit.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR
+from rayfix_offline.fit.tubes import joint_to_tubes
+from rayfix_offline.rays.trace import LevelRays
+from rayfix_tables.angles import tangent, wrap
+from rayfix_tables.mixture import TubeMixture
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpectationMaximisation:
+    """Settings of the fit.
+
+    Attributes
+    ----------
+    num_points : int
+        Points drawn for a cell.
+    num_components : tuple of int
+        Numbers of components among which BIC chooses.
+    seed : int
+        Each cell draws with the seed (seed, cell).
+    """
+
+    num_points: int = 3000
+    num_components: tuple[int, ...] = (4, 8, 16)
+    seed: int = 1
+
+
+def fit_em(
+    centres: NDArray[np.float64], cells: NDArray[np.int64], level: LevelRays, fit: ExpectationMaximisation
+) -> tuple[NDArray[np.int64], NDArray[np.float64], TubeMixture]:
+    """Fit a block of cells; see :func:`rayfix_offline.fit.tubes.fit_tubes` for what comes back.
+
+    Parameters
+    ----------
+    centres : ndarray of shape (n_cells, 2), rad
+    cells : ndarray of int64, shape (n_cells,)
+        Numbers of the cells, for their seeds.
+    """
+    counts = np.zeros(len(cells), np.int64)
+    log_mass = np.full(len(cells), -np.inf)
+    parts = []
+    with threadpool_limits(limits=1):
+        for n, (centre, cell) in enumerate(zip(centres, cells, strict=True)):
+            rng = np.random.default_rng([fit.seed, int(cell)])
+            points, num_reflections, mass = sample_points(centre, level, fit.num_points, rng)
+            if not len(points):
+                continue
+            log_mass[n] = np.log(mass)
+            parts.append(_fit_points(points, num_reflections, fit, int(rng.integers(2**31))))
+            counts[n] = len(parts[-1])
+    return counts, log_mass, TubeMixture.concatenate(parts)
+
+
+def sample_points(
+    centre: NDArray[np.float64], level: LevelRays, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.int8], float]:
+    """Draw points from the measure of a cell.
+
+    Returns
+    -------
+    points : ndarray of shape (count, 6)
+        (path length, horizontal and vertical angle, x, y, z); none where no ray comes.
+    num_reflections : ndarray of int8, shape (count,)
+    mass : float
+        The cell's mass.
+    """
+    rays, pieces, sequences = level.rays, level.pieces, level.sequences
+    reach = CUTOFF * level.window
+    near = np.flatnonzero(
+        (np.abs(rays.zenith - centre[1]) <= reach)
+        & (np.abs(wrap(rays.azimuth - centre[0])) * np.sin(centre[1]) <= reach)
+    )
+    offset = tangent(rays.azimuth[near], rays.zenith[near], centre[0], centre[1])
+    square = np.einsum("ij,ij->i", offset, offset) / level.window**2
+    inside = square <= CUTOFF**2
+    near, offset, square = near[inside], offset[inside], square[inside]
+    density = np.exp(-0.5 * square) / (2.0 * np.pi * level.window**2) * rays.solid_angle[near]
+    chosen = pieces.of_rays(near)
+    ray = np.repeat(np.arange(len(near)), np.diff(chosen.offsets))
+    weight = density[ray] * chosen.mass
+    mass = float(weight.sum())
+    if mass <= 0.0:
+        return np.zeros((0, 6)), np.zeros(0, np.int8), 0.0
+    drawn = rng.choice(len(weight), size=count, p=weight / mass)
+    # A ray stands for a patch of directions and a piece for a stretch of lengths.
+    half = np.sqrt(3.0 * chosen.variance[drawn])
+    length = chosen.mean[drawn] + half * rng.uniform(-1.0, 1.0, count)
+    jitter = rng.uniform(-0.5, 0.5, (count, 2)) * level.ray_spacing
+    at = offset[ray[drawn]] + jitter
+    azimuth = centre[0] + at[:, 0] / np.sin(centre[1])
+    zenith = centre[1] + at[:, 1]
+    sine = np.sin(zenith)
+    launched = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
+    sequence = chosen.sequence[drawn]
+    position = sequences.images[sequence] + length[:, None] * np.einsum(
+        "nij,nj->ni", sequences.mirrors[sequence], launched
+    )
+    points = np.concatenate([length[:, None], at, position], axis=1)
+    return points, sequences.num_reflections[sequence], mass
+
+
+def _fit_points(
+    points: NDArray[np.float64], num_reflections: NDArray[np.int8], fit: ExpectationMaximisation, seed: int
+) -> TubeMixture:
+    scale = np.maximum(points.std(axis=0), 1e-6)
+    scaled = (points - points.mean(axis=0)) / scale
+    best: tuple[float, GaussianMixture] | None = None
+    for num_components in fit.num_components:
+        mixture = GaussianMixture(num_components, reg_covar=1e-6, random_state=seed, max_iter=200)
+        with warnings.catch_warnings():
+            # A mixture that has not settled after 200 rounds is judged by its BIC like any other.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            mixture.fit(scaled)
+        bic = float(mixture.bic(scaled))
+        if best is None or bic < best[0]:
+            best = (bic, mixture)
+    assert best is not None
+    chosen = best[1]
+    floor = np.array([0.0, 0.0, 0.0, POSITION_FLOOR, POSITION_FLOOR, POSITION_FLOOR]) ** 2
+    cov = chosen.covariances_ * np.outer(scale, scale) + np.diag(floor)
+    member = chosen.predict(scaled)
+    reflections = np.array(
+        [
+            np.bincount(num_reflections[member == k]).argmax() if np.any(member == k) else 0
+            for k in range(len(chosen.weights_))
+        ],
+        np.int8,
+    )
+    tubes = joint_to_tubes(
+        np.log(np.maximum(chosen.weights_, 1e-12)),
+        chosen.means_ * scale + points.mean(axis=0),
+        cov,
+        reflections,
+    )
+    # The floor of the length lies along the tube: the position moves with it.
+    u_cov = tubes.u_cov.copy()
+    u_cov[:, 0] += LENGTH_FLOOR**2
+    return replace(tubes, u_cov=u_cov)

@@ -1,0 +1,355 @@
+"""Moments of a cell's ray pieces, grouped by reflection sequence and slice.
+
+The joint vector is (path length, horizontal angle, vertical angle, x, y, z); the angles are tangent coordinates of the
+cell.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.rays.pieces import Pieces
+from rayfix_offline.rays.rays import RaySet
+from rayfix_offline.rays.segments import Sequences
+
+SIZE = 6
+"""Length of the joint vector."""
+
+CUTOFF = 3.0
+"""A cell gathers rays within this many standard deviations of its window."""
+
+POSITION_FLOOR = 0.002
+"""Standard deviation that every component has at least across its tube, m."""
+
+LENGTH_FLOOR = 0.05
+"""Standard deviation that every component has at least along its tube, m."""
+
+NUM_SUMS = 28
+"""Sums of a group: 6 of mass (1, a, a a), 12 of mass x length (1, a, d, d a), 10 of mass x length^2 (1, d, d d)."""
+
+
+@numba.njit(cache=True, nogil=True)
+def ring_span(azimuth: Any, reach: Any, cells: Any) -> Any:
+    """First step, and the one after the last, of those of a ring's cells that lie within a reach [rad] of an azimuth.
+
+    Steps count from -pi and may be outside of the ring, to be taken modulo its cells.
+    """
+    half = reach / (2.0 * np.pi) * cells
+    middle = (azimuth + np.pi) / (2.0 * np.pi) * cells
+    if 2.0 * half + 2.0 >= cells:
+        return 0, cells
+    return int(np.floor(middle - half)), int(np.floor(middle + half)) + 1
+
+
+def gathered_arrays(rays: RaySet, pieces: Pieces, sequences: Sequences) -> tuple[NDArray[Any], ...]:
+    """Return what cells gather, in the order in which :func:`gather_groups` takes it, from ``ring_offsets`` on."""
+    return (
+        rays.grid.ring_offsets,
+        rays.grid.ring_cells,
+        rays.azimuth,
+        rays.zenith,
+        rays.solid_angle,
+        rays.directions,
+        pieces.offsets,
+        pieces.sequence,
+        pieces.slice,
+        pieces.mass,
+        pieces.mean,
+        pieces.variance,
+        sequences.images,
+        sequences.mirrors,
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def gather_groups(
+    centre_azimuth: Any,
+    centre_zenith: Any,
+    window: Any,
+    ring_offsets: Any,
+    ring_cells: Any,
+    azimuth: Any,
+    zenith: Any,
+    solid_angle: Any,
+    directions: Any,
+    piece_offsets: Any,
+    piece_sequence: Any,
+    piece_slice: Any,
+    piece_mass: Any,
+    piece_mean: Any,
+    piece_variance: Any,
+    images: Any,
+    mirrors: Any,
+    num_slices: Any,
+    rows: Any,
+) -> Any:
+    """Add up the weighted moments of one cell.
+
+    Of a ray with launch direction d and tangent angles a, a piece of path length L lies at ``image + mirror @ (L d)``.
+    So the moments of (L, a, L d) are those of L times products of a and d, which are the same for all its pieces.
+
+    Parameters
+    ----------
+    window : float, rad
+        Standard deviation of the cell's window.
+    num_slices : int
+        Slices are numbered below this.
+    rows : ndarray of int32, shape (n_sequences,)
+        Scratch, all -1; left so.
+
+    Returns
+    -------
+    sequence : ndarray of int64, shape (n_groups,)
+    slice : ndarray of int64, shape (n_groups,)
+    mass : ndarray of shape (n_groups,)
+    mean : ndarray of shape (n_groups, 6)
+    cov : ndarray of shape (n_groups, 6, 6)
+    """
+    keys = np.empty((64, 2), np.int64)
+    sums = np.zeros((64, NUM_SUMS))
+    count = np.int64(0)  # plain zeros would have _add_ray compiled once more, for constants
+    # Groups by slice, for the sequences that the cell has: all of a station's would be too many to keep a place for.
+    slots = np.full((64, num_slices), -1, np.int32)
+    num_rows = np.int64(0)
+    sine = np.sin(centre_zenith)
+    reach = CUTOFF * window
+    num_rings = len(ring_cells)
+    first_ring = max(0, int((centre_zenith - reach) / np.pi * num_rings))
+    last_ring = min(num_rings - 1, int((centre_zenith + reach) / np.pi * num_rings))
+    for ring in range(first_ring, last_ring + 1):
+        cells = ring_cells[ring]
+        begin, stop = ring_span(centre_azimuth, reach / sine, cells)
+        for step in range(begin, stop):
+            ray = ring_offsets[ring] + step % cells
+            turn = azimuth[ray] - centre_azimuth
+            turn -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
+            horizontal = sine * turn
+            vertical = zenith[ray] - centre_zenith
+            square = (horizontal * horizontal + vertical * vertical) / (window * window)
+            if square > CUTOFF * CUTOFF:
+                continue
+            density = np.exp(-0.5 * square) / (2.0 * np.pi * window * window) * solid_angle[ray]
+            first, last = piece_offsets[ray], piece_offsets[ray + 1]
+            if count + last - first > len(sums):
+                capacity = 2 * (count + last - first)
+                keys, sums = _grown(keys, capacity, 0), _grown(sums, capacity, 0)
+            if num_rows + last - first > len(slots):
+                slots = _grown(slots, 2 * (num_rows + last - first), -1)
+            count, num_rows = _add_ray(
+                density,
+                horizontal,
+                vertical,
+                directions[ray],
+                piece_sequence[first:last],
+                piece_slice[first:last],
+                piece_mass[first:last],
+                piece_mean[first:last],
+                piece_variance[first:last],
+                rows,
+                slots,
+                keys,
+                sums,
+                count,
+                num_rows,
+            )
+
+    masses = np.empty(count)
+    means = np.empty((count, SIZE))
+    covs = np.empty((count, SIZE, SIZE))
+    for group in range(count):
+        rows[keys[group, 0]] = -1
+        masses[group] = sums[group, 0]
+        _to_moments(sums[group], images[keys[group, 0]], mirrors[keys[group, 0]], means[group], covs[group])
+    return keys[:count, 0], keys[:count, 1], masses, means, covs
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_ray(
+    density: Any,
+    horizontal: Any,
+    vertical: Any,
+    heading: Any,
+    sequence: Any,
+    slices: Any,
+    piece_mass: Any,
+    piece_mean: Any,
+    piece_variance: Any,
+    rows: Any,
+    slots: Any,
+    keys: Any,
+    sums: Any,
+    count: Any,
+    num_rows: Any,
+) -> Any:
+    """Add a ray's pieces to the sums of their groups, and return the numbers of groups and of sequences.
+
+    What is added is mass, mass x length and mass x length^2, times products of a and d. It is written out, so that
+    the products stay in the processor's registers for all pieces of the ray: in loops it takes three times as long.
+    """
+    x, y, z = heading[0], heading[1], heading[2]
+    for piece in range(len(piece_mass)):
+        mass = density * piece_mass[piece]
+        if mass <= 0.0:
+            continue
+        row = rows[sequence[piece]]
+        if row < 0:
+            row = num_rows
+            num_rows += 1
+            rows[sequence[piece]] = row
+        group = slots[row, slices[piece]]
+        if group < 0:
+            group = count
+            count += 1
+            slots[row, slices[piece]] = group
+            keys[group, 0] = sequence[piece]
+            keys[group, 1] = slices[piece]
+        once = mass * piece_mean[piece]
+        twice = mass * (piece_variance[piece] + piece_mean[piece] * piece_mean[piece])
+        sums[group, 0] += mass
+        sums[group, 1] += mass * horizontal
+        sums[group, 2] += mass * vertical
+        sums[group, 3] += mass * (horizontal * horizontal)
+        sums[group, 4] += mass * (horizontal * vertical)
+        sums[group, 5] += mass * (vertical * vertical)
+        sums[group, 6] += once
+        sums[group, 7] += once * horizontal
+        sums[group, 8] += once * vertical
+        sums[group, 9] += once * x
+        sums[group, 10] += once * y
+        sums[group, 11] += once * z
+        sums[group, 12] += once * (x * horizontal)
+        sums[group, 13] += once * (y * horizontal)
+        sums[group, 14] += once * (z * horizontal)
+        sums[group, 15] += once * (x * vertical)
+        sums[group, 16] += once * (y * vertical)
+        sums[group, 17] += once * (z * vertical)
+        sums[group, 18] += twice
+        sums[group, 19] += twice * x
+        sums[group, 20] += twice * y
+        sums[group, 21] += twice * z
+        sums[group, 22] += twice * (x * x)
+        sums[group, 23] += twice * (x * y)
+        sums[group, 24] += twice * (x * z)
+        sums[group, 25] += twice * (y * y)
+        sums[group, 26] += twice * (y * z)
+        sums[group, 27] += twice * (z * z)
+    return count, num_rows
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_moments(sums: Any, image: Any, mirror: Any, mean: Any, cov: Any) -> None:
+    """Turn the sums of a group into the mean and covariance of (L, a, x)."""
+    raw = np.empty((SIZE, SIZE))
+    first = np.empty(SIZE)
+    mass = sums[0]
+    first[0] = sums[6] / mass
+    first[1] = sums[1] / mass
+    first[2] = sums[2] / mass
+    raw[0, 0] = sums[18] / mass
+    raw[0, 1] = sums[7] / mass
+    raw[0, 2] = sums[8] / mass
+    raw[1, 1] = sums[3] / mass
+    raw[1, 2] = sums[4] / mass
+    raw[2, 2] = sums[5] / mass
+    place = 21 + 1
+    for i in range(3):
+        first[3 + i] = sums[9 + i] / mass
+        raw[1, 3 + i] = sums[12 + i] / mass
+        raw[2, 3 + i] = sums[15 + i] / mass
+        raw[0, 3 + i] = sums[19 + i] / mass
+        for j in range(i, 3):
+            raw[3 + i, 3 + j] = sums[place] / mass
+            place += 1
+    for i in range(SIZE):
+        for j in range(i, SIZE):
+            raw[i, j] -= first[i] * first[j]
+            raw[j, i] = raw[i, j]
+    # From the unfolded position L d to the real one, x = image + mirror @ (L d).
+    for i in range(3):
+        mean[i] = first[i]
+        mean[3 + i] = image[i]
+        for j in range(3):
+            cov[i, j] = raw[i, j]
+            mean[3 + i] += mirror[i, j] * first[3 + j]
+            cov[3 + i, j] = mirror[i, 0] * raw[3, j] + mirror[i, 1] * raw[4, j] + mirror[i, 2] * raw[5, j]
+            cov[j, 3 + i] = cov[3 + i, j]
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                total += mirror[j, k] * (
+                    mirror[i, 0] * raw[3, 3 + k] + mirror[i, 1] * raw[4, 3 + k] + mirror[i, 2] * raw[5, 3 + k]
+                )
+            cov[3 + i, 3 + j] = total
+
+
+@numba.njit(cache=True, nogil=True)
+def blur(
+    mean: Any,
+    cov: Any,
+    mirror: Any,
+    centre_azimuth: Any,
+    centre_zenith: Any,
+    ray_spacing: Any,
+) -> None:
+    """Give a group the width of its rays: each stands for a patch of directions, and nothing is exact to a millimetre.
+
+    Parameters
+    ----------
+    mean : ndarray of shape (6,)
+    cov : ndarray of shape (6, 6)
+        Changed in place.
+    mirror : ndarray of shape (3, 3)
+        Of the group's reflection sequence.
+    ray_spacing : float, rad
+    """
+    sine = np.sin(centre_zenith)
+    azimuth = centre_azimuth + mean[1] / sine
+    zenith = min(max(centre_zenith + mean[2], 0.0), np.pi)
+    local = np.empty((3, 3))
+    local[0, 0] = np.sin(zenith) * np.cos(azimuth)
+    local[1, 0] = np.sin(zenith) * np.sin(azimuth)
+    local[2, 0] = np.cos(zenith)
+    local[0, 1] = -np.sin(azimuth) * mean[0] * np.sin(zenith) / sine
+    local[1, 1] = np.cos(azimuth) * mean[0] * np.sin(zenith) / sine
+    local[2, 1] = 0.0
+    local[0, 2] = np.cos(zenith) * np.cos(azimuth) * mean[0]
+    local[1, 2] = np.cos(zenith) * np.sin(azimuth) * mean[0]
+    local[2, 2] = -np.sin(zenith) * mean[0]
+    variances = (
+        LENGTH_FLOOR * LENGTH_FLOOR,
+        ray_spacing * ray_spacing / 12.0,
+        ray_spacing * ray_spacing / 12.0,
+    )
+    for k in range(3):
+        for i in range(3):
+            step_i = 0.0
+            for a in range(3):
+                step_i += mirror[i, a] * local[a, k]
+            cov[3 + i, k] += variances[k] * step_i
+            cov[k, 3 + i] += variances[k] * step_i
+            for j in range(3):
+                step_j = 0.0
+                for a in range(3):
+                    step_j += mirror[j, a] * local[a, k]
+                cov[3 + i, 3 + j] += variances[k] * step_i * step_j
+        cov[k, k] += variances[k]
+    for i in range(3):
+        cov[3 + i, 3 + i] += POSITION_FLOOR * POSITION_FLOOR
+
+
+@numba.njit(cache=True, nogil=True)
+def _grown(array: Any, capacity: Any, filling: Any) -> Any:
+    """Copy rows into a larger array, in loops: an assignment of slices takes seconds to compile."""
+    larger = np.full((capacity, array.shape[1]), filling, array.dtype)
+    for i in range(len(array)):
+        for j in range(array.shape[1]):
+            larger[i, j] = array[i, j]
+    return larger
+
+
+def new_rows(num_sequences: int) -> NDArray[np.int32]:
+    """Scratch for :func:`gather_groups`."""
+    return np.full(num_sequences, -1, np.int32)

@@ -1,0 +1,227 @@
+"""Balance a level's components: at each place, the probabilities of its paths are to add up to 1.
+
+Of a UE at x, a station reports one of the paths to x, so that what the level says of x, summed over all directions and
+lengths, is 1 wherever the station is heard. Its Gaussians are smooth where beams end, at walls and shadows, so that the
+sum, the place's *share*, is too small there and too large beside. Of one station that hardly matters; but a fusion
+multiplies, so that what four stations say of a place at a wall would be too small four times over, and the posterior
+too sure that the UE is in the middle of the room.
+
+A component is raised by the mean of 1 / share over the free places that it covers. Then shares have changed, so that is
+repeated (the iteration of W. H. Richardson, "Bayesian-based iterative method of image restoration", J. Opt. Soc. Am.
+62 (1), 1972, with an even image). A round changes no component by more than a factor of two: where a share is much
+smaller, the station is not heard at all, and what is there has leaked from elsewhere.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.gaussians.conditioning import LOG_2PI, condition_on_angle
+from rayfix_tables.gaussians.normal_points import normal_points
+from rayfix_tables.level import UNBALANCED, WINDOW_RATIO, Level
+
+_ROUNDS = 3
+
+_MOST = 2.0
+"""Factor by which a round raises or lowers a place at most."""
+
+_SIDE = 0.2
+"""Side of the blocks, m, in which shares are counted, unless voxels are larger."""
+
+_NUM_POINTS = 64
+"""Points that stand for a component."""
+
+_THIN = 1e-6
+"""Added to the variances of a component, m2: rounding may have made it singular."""
+
+_CHUNK = 2**16
+"""Components that are conditioned at a time."""
+
+Array = NDArray[np.float64]
+
+
+def balanced(level: Level, free_space: FreeSpace) -> Level:
+    """Give a level its ``log_balance``.
+
+    Parameters
+    ----------
+    level : Level
+    free_space : FreeSpace
+        Of the scene that the level was made for.
+    """
+    if not len(level.mixture):
+        return replace(level, log_balance=UNBALANCED)
+    places = _places(level)
+    points = np.array(normal_points(_NUM_POINTS))
+    blocks = _blocks(free_space)
+    weight = places.weight.copy()
+    log_balance = np.zeros(len(weight))
+    for _ in range(_ROUNDS):
+        share = _shares(weight, places, points, blocks)
+        ratio = np.where(share > 0.0, 1.0 / np.clip(share, 1.0 / _MOST, _MOST), 1.0)
+        gain = np.empty(len(weight))
+        _gather(places.mean, places.root, points, *blocks.voxels, ratio, gain)
+        weight *= gain
+        log_balance += np.log(gain)
+    return replace(level, log_balance=log_balance.astype(np.float32))
+
+
+class _Places(NamedTuple):
+    """Where the paths of each component lead, over all directions that may be measured.
+
+    Attributes
+    ----------
+    weight : ndarray of shape (n,), m3
+        Integral of the component's probability over places and directions.
+    mean : ndarray of shape (n, 3), m
+    root : ndarray of shape (n, 3, 3), m
+        Lower triangular; root root' is the covariance of the position.
+    """
+
+    weight: Array
+    mean: NDArray[np.float32]
+    root: NDArray[np.float32]
+
+
+class _Blocks(NamedTuple):
+    """Blocks of voxels.
+
+    Attributes
+    ----------
+    side : int
+        Voxels along a side.
+    volume : ndarray of shape (nx, ny, nz), m3
+        Of the free part.
+    """
+
+    origin: Array
+    voxel_size: float
+    free: NDArray[np.bool_]
+    side: int
+    volume: Array
+
+    @property
+    def voxels(self) -> tuple[Array, float, NDArray[np.bool_], int]:
+        """What the kernels need."""
+        return self.origin, self.voxel_size, self.free, self.side
+
+
+def _places(level: Level) -> _Places:
+    """Condition all cells on the noise that the window is for, with the measurement in the middle of the cell.
+
+    Times the cells' solid angles, that sums over the directions that may be measured.
+    """
+    window = level.window**2
+    noise = window / WINDOW_RATIO**2
+    left = window - noise
+    log_factor = np.repeat(np.log(level.grid.solid_angles), level.grid.ring_cells) + level.cell_log_mass
+    log_factor += LOG_2PI + 2.0 * np.log(window) - np.log(left)
+    mixture, count = level.mixture, len(level.mixture)
+    weight = np.empty(count)
+    mean, root = np.empty((count, 3), np.float32), np.empty((count, 3, 3), np.float32)
+    for first, last in level.ranges(_CHUNK):
+        begin, end = int(level.cell_offsets[first]), int(level.cell_offsets[last])
+        cells = slice(first, last)
+        log_evidence, at, cov = np.empty(end - begin), np.empty((end - begin, 4)), np.empty((end - begin, 4, 4))
+        condition_on_angle(
+            *mixture.tubes,
+            np.asarray(level.cell_offsets[:-1][cells], np.int64),
+            np.asarray(level.cell_offsets[1:][cells], np.int64),
+            np.zeros((last - first, 2)),
+            np.repeat(np.array([[1.0, 0.0, 1.0]]) * window * noise / left, last - first, axis=0),
+            log_factor[cells],
+            log_evidence,
+            at,
+            cov,
+        )
+        weight[begin:end], mean[begin:end] = np.exp(log_evidence), at[:, :3]
+        root[begin:end] = np.linalg.cholesky(cov[:, :3, :3] + _THIN * np.eye(3))
+    return _Places(weight, mean, root)
+
+
+def _blocks(free_space: FreeSpace) -> _Blocks:
+    side = max(1, round(_SIDE / free_space.voxel_size))
+    shape = -(-np.array(free_space.free.shape) // side)
+    padded = np.zeros(shape * side)
+    nx, ny, nz = free_space.free.shape
+    padded[:nx, :ny, :nz] = free_space.free
+    count = padded.reshape(shape[0], side, shape[1], side, shape[2], side).sum(axis=(1, 3, 5))
+    return _Blocks(
+        origin=np.array(free_space.origin, np.float64),
+        voxel_size=free_space.voxel_size,
+        free=np.array(free_space.free, np.bool_),
+        side=side,
+        volume=count * free_space.voxel_size**3,
+    )
+
+
+def _shares(weight: Array, places: _Places, points: Array, blocks: _Blocks) -> Array:
+    mass = np.zeros_like(blocks.volume)
+    _spread(weight, places.mean, places.root, points, *blocks.voxels, mass)
+    return np.divide(mass, blocks.volume, out=np.zeros_like(mass), where=blocks.volume > 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _block_of(x: Any, y: Any, z: Any, free: Any, side: Any, shape: Any) -> Any:
+    """Block of a place, counted from 0 in C order; -1 for one that is not free; coordinates are in voxels."""
+    nx, ny, nz = free.shape
+    i, j, k = np.floor(x), np.floor(y), np.floor(z)
+    if not (0 <= i < nx and 0 <= j < ny and 0 <= k < nz and free[int(i), int(j), int(k)]):
+        return -1
+    return (int(i) // side * shape[1] + int(j) // side) * shape[2] + int(k) // side
+
+
+@numba.njit(cache=True, nogil=True)
+def _blocks_of(mean: Any, root: Any, points: Any, origin: Any, voxel_size: Any, free: Any, side: Any, out: Any) -> None:
+    """Blocks of a component's points."""
+    shape = (0, -(-free.shape[1] // side), -(-free.shape[2] // side))
+    x0, y0, z0 = mean[0] - origin[0], mean[1] - origin[1], mean[2] - origin[2]
+    xx, yx, yy, zx, zy, zz = root[0, 0], root[1, 0], root[1, 1], root[2, 0], root[2, 1], root[2, 2]
+    for n in range(len(points)):
+        p, q, r = points[n, 0], points[n, 1], points[n, 2]
+        x, y, z = x0 + xx * p, y0 + (yx * p + yy * q), z0 + (zx * p + zy * q + zz * r)
+        out[n] = _block_of(x / voxel_size, y / voxel_size, z / voxel_size, free, side, shape)
+
+
+@numba.njit(cache=True, nogil=True)
+def _spread(
+    weight: Any, mean: Any, root: Any, points: Any, origin: Any, voxel_size: Any, free: Any, side: Any, mass: Any
+) -> None:
+    """Add the components' weights to the blocks that their points are in."""
+    flat = mass.reshape(-1)
+    blocks = np.empty(len(points), np.int64)
+    for n in range(len(weight)):
+        each = weight[n] / len(points)
+        _blocks_of(mean[n], root[n], points, origin, voxel_size, free, side, blocks)
+        for block in blocks:
+            if block >= 0:
+                flat[block] += each
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(
+    mean: Any,
+    root: Any,
+    points: Any,
+    origin: Any,
+    voxel_size: Any,
+    free: Any,
+    side: Any,
+    values: Any,
+    out: Any,
+) -> None:
+    """Means of a block's values over the free points of each component; 1 where none is free."""
+    flat = values.reshape(-1)
+    blocks = np.empty(len(points), np.int64)
+    for n in range(len(mean)):
+        total, count = 0.0, 0
+        _blocks_of(mean[n], root[n], points, origin, voxel_size, free, side, blocks)
+        for block in blocks:
+            if block >= 0:
+                total += flat[block]
+                count += 1
+        out[n] = total / count if count else 1.0

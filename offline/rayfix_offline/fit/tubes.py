@@ -1,0 +1,204 @@
+"""``fit = "tubes"``: cells fitted by analytic moments of their ray pieces, then merged."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.fit.join_surfaces import join_groups
+from rayfix_offline.fit.moments import POSITION_FLOOR, blur, gather_groups, gathered_arrays, new_rows
+from rayfix_offline.fit.runnalls import merge_runnalls
+from rayfix_offline.rays.trace import LevelRays
+from rayfix_tables.mixture import TubeMixture, pack, widening_cov
+
+
+@dataclass(frozen=True, kw_only=True)
+class TubeFit:
+    """Settings of the fit.
+
+    Attributes
+    ----------
+    dropped_mass : float
+        Share of a cell's mass that may go with its lightest groups.
+    max_groups : int
+        Heaviest groups of a cell that are looked at.
+    max_components : int
+        Most components of a cell.
+    max_divergence : float
+        Divergence that a merge may cost, nats.
+    """
+
+    dropped_mass: float = 1e-5
+    max_groups: int = 250
+    max_components: int = 48
+    max_divergence: float = 1e-2
+
+
+def fit_tubes(
+    centres: NDArray[np.float64], level: LevelRays, fit: TubeFit
+) -> tuple[NDArray[np.int64], NDArray[np.float64], TubeMixture]:
+    """Fit a block of cells.
+
+    Parameters
+    ----------
+    centres : ndarray of shape (n_cells, 2), rad
+        Azimuths and zeniths.
+
+    Returns
+    -------
+    counts : ndarray of int64, shape (n_cells,)
+        Components of each cell.
+    log_mass : ndarray of shape (n_cells,)
+        Natural logarithm of each cell's mass; -inf where no ray comes.
+    mixture : TubeMixture
+        Components of all cells.
+    """
+    sequences = level.sequences
+    counts, log_mass, log_weight, mean, cov, label = _fit_block(
+        centres,
+        level.window,
+        *gathered_arrays(level.rays, level.pieces, sequences),
+        level.surface_sequences,
+        bool(np.any(level.surface_sequences != np.arange(len(sequences.images)))),
+        level.pieces.num_slices,
+        level.ray_spacing,
+        fit.dropped_mass,
+        fit.max_groups,
+        fit.max_components,
+        fit.max_divergence,
+        new_rows(len(sequences.images)),
+    )
+    return counts, log_mass, joint_to_tubes(log_weight, mean, cov, sequences.num_reflections[label])
+
+
+def joint_to_tubes(
+    log_weight: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    cov: NDArray[np.float64],
+    num_reflections: NDArray[np.int8],
+) -> TubeMixture:
+    """Turn joint moments of (u, x) into the table's form, u and x given u.
+
+    Parameters
+    ----------
+    mean : ndarray of shape (n, 6)
+    cov : ndarray of shape (n, 6, 6)
+    """
+    u_cov = cov[:, :3, :3]
+    jacobian = np.swapaxes(np.linalg.solve(u_cov, cov[:, :3, 3:]), 1, 2) if len(mean) else np.zeros((0, 3, 3))
+    x_cov = cov[:, 3:, 3:] - jacobian @ cov[:, :3, 3:] - widening_cov(mean[:, :3], u_cov, jacobian)
+    # Of components that are not quite one tube, the widening that one would have may be more than there is.
+    spread, axes = np.linalg.eigh(x_cov)
+    spread = np.maximum(spread, POSITION_FLOOR**2)
+    x_cov = (axes * spread[:, None, :]) @ axes.transpose(0, 2, 1)
+    return TubeMixture(
+        log_weight=log_weight,
+        u_mean=mean[:, :3],
+        u_cov=pack(u_cov),
+        x_mean=mean[:, 3:],
+        jacobian=jacobian,
+        x_cov=pack(x_cov),
+        num_reflections=num_reflections,
+    ).as_stored()
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_block(
+    centres: Any,
+    window: Any,
+    ring_offsets: Any,
+    ring_cells: Any,
+    azimuth: Any,
+    zenith: Any,
+    solid_angle: Any,
+    directions: Any,
+    piece_offsets: Any,
+    piece_sequence: Any,
+    piece_slice: Any,
+    piece_mass: Any,
+    piece_mean: Any,
+    piece_variance: Any,
+    images: Any,
+    mirrors: Any,
+    surface_sequences: Any,
+    curved: Any,
+    num_slices: Any,
+    ray_spacing: Any,
+    dropped_mass: Any,
+    max_groups: Any,
+    max_components: Any,
+    max_divergence: Any,
+    rows: Any,
+) -> Any:
+    num_cells = len(centres)
+    counts = np.zeros(num_cells, np.int64)
+    log_mass = np.full(num_cells, -np.inf)
+    log_weight = np.empty(num_cells * max_components)
+    mean = np.empty((num_cells * max_components, 6))
+    cov = np.empty((num_cells * max_components, 6, 6))
+    label = np.empty(num_cells * max_components, np.int64)
+    total = 0
+    for cell in range(num_cells):
+        seq, slices, mass, group_mean, group_cov = gather_groups(
+            centres[cell, 0],
+            centres[cell, 1],
+            window,
+            ring_offsets,
+            ring_cells,
+            azimuth,
+            zenith,
+            solid_angle,
+            directions,
+            piece_offsets,
+            piece_sequence,
+            piece_slice,
+            piece_mass,
+            piece_mean,
+            piece_variance,
+            images,
+            mirrors,
+            num_slices,
+            rows,
+        )
+        group_mirror = mirrors[seq]
+        if curved:
+            seq, mass, group_mean, group_cov, group_mirror = join_groups(
+                surface_sequences[seq], slices, mass, group_mean, group_cov, group_mirror
+            )
+        whole = mass.sum()
+        if whole <= 0.0:
+            continue
+        order = np.argsort(-mass)
+        kept = 0
+        gone = whole
+        while kept < min(len(mass), max_groups) and gone > dropped_mass * whole:
+            gone -= mass[order[kept]]
+            kept += 1
+        chosen = order[:kept]
+        weight = mass[chosen] / mass[chosen].sum()
+        part_mean = group_mean[chosen]
+        part_cov = group_cov[chosen]
+        part_label = seq[chosen]
+        part_mirror = group_mirror[chosen]
+        for i in range(kept):
+            blur(
+                part_mean[i],
+                part_cov[i],
+                part_mirror[i],
+                centres[cell, 0],
+                centres[cell, 1],
+                ray_spacing,
+            )
+        alive = merge_runnalls(weight, part_mean, part_cov, part_label, max_components, max_divergence)
+        log_mass[cell] = np.log(whole)
+        for i in range(kept):
+            if alive[i]:
+                log_weight[total] = np.log(weight[i])
+                mean[total] = part_mean[i]
+                cov[total] = part_cov[i]
+                label[total] = part_label[i]
+                total += 1
+                counts[cell] += 1
+    return counts, log_mass, log_weight[:total], mean[:total], cov[:total], label[:total]

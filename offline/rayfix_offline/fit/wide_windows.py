@@ -1,0 +1,257 @@
+"""Cells of wide windows, each the sum of cells of the next finer level.
+
+The windows of the finer cells f around a cell c add up to its own, N(a; 0, W) = sum_f q_f N(a - f; 0, W_f) with
+``q_f = N(f; 0, W - W_f) dOmega_f``: their grid is so close that the sum is flat to 1e-5. Rays need not be gathered
+again, and a wide cell keeps what fine cells know of the edges that cut its rays off, where Gaussians gathered over the
+wide window would blur them.
+
+Such a sum has thousands of components, most of which no report that needs the wide window could tell apart: it is
+looked up for angles with more noise than the finer level serves. They are merged under that noise.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.fit.moments import SIZE
+from rayfix_offline.fit.tubes import joint_to_tubes
+from rayfix_tables.gaussians.tree_reduction import halve_and_merge
+from rayfix_tables.level import WINDOW_RATIO, Level
+from rayfix_tables.mixture import TubeMixture
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoarseFit:
+    """Settings of the sums.
+
+    Attributes
+    ----------
+    reach : float
+        Finer cells are summed within this many standard deviations.
+    max_divergence : float
+        Divergence that a merge may cost, nats, under the noise of measurements.
+    noise_share : float
+        That noise is this share of the least noise of angles for which the wide window is looked up.
+    range_stdev : float, m
+        And of path lengths this.
+    """
+
+    reach: float = 3.0
+    max_divergence: float = 1e-2
+    noise_share: float = 0.5
+    range_stdev: float = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class SummedCells:
+    """Cells of a wide window.
+
+    Attributes
+    ----------
+    counts : ndarray of int64, shape (n_cells,)
+        Components of each cell.
+    log_mass : ndarray of shape (n_cells,)
+        Natural logarithm of each cell's mass; -inf where no ray comes.
+    change : ndarray of shape (n_cells,)
+        Bound on the change of each cell's measure, as a share of its mass.
+    mixture : TubeMixture
+        Components of all cells.
+    """
+
+    counts: NDArray[np.int64]
+    log_mass: NDArray[np.float64]
+    change: NDArray[np.float64]
+    mixture: TubeMixture
+
+
+def sum_cells(
+    centres: NDArray[np.float64], window: float, finer: Level, finer_change: NDArray[np.float32], fit: CoarseFit
+) -> SummedCells:
+    """Make cells of a wide window.
+
+    Parameters
+    ----------
+    centres : ndarray of shape (n_cells, 2), rad
+        Azimuths and zeniths.
+    window : float, rad
+        At least ``LEAST_WINDOW_RATIO`` of the site file times the finer level's.
+    finer_change : ndarray of shape (n_finer_cells,)
+        Bound on the change of each finer cell's measure, as a share of its mass.
+    """
+    # Less noise than this is served by the finer level itself.
+    angle = fit.noise_share * finer.window / WINDOW_RATIO
+    noise = np.array([fit.range_stdev**2, angle**2, angle**2, 0.0, 0.0, 0.0])
+    # A change is a share of the mass as it would be, and what is summed are masses as they are.
+    of_present = finer_change / np.maximum(1.0 - finer_change, 0.5)
+    counts = np.zeros(len(centres), np.int64)
+    log_mass, change = np.empty(len(centres)), np.empty(len(centres))
+    mixture = finer.mixture
+    parts = []
+    for n, (azimuth, zenith) in enumerate(centres):
+        log_mass[n], change[n], weight, mean, cov, num_reflections = _sum_cell(
+            azimuth,
+            zenith,
+            window,
+            finer.window,
+            finer.grid.ring_offsets,
+            finer.grid.ring_cells,
+            finer.grid.solid_angles,
+            finer.cell_offsets,
+            finer.cell_log_mass,
+            of_present,
+            mixture.log_weight,
+            mixture.u_mean,
+            mixture.u_cov,
+            mixture.x_mean,
+            mixture.jacobian,
+            mixture.x_cov,
+            mixture.num_reflections,
+            noise,
+            fit.reach,
+            fit.max_divergence,
+        )
+        counts[n] = len(weight)
+        parts.append(joint_to_tubes(np.log(weight), mean, cov, num_reflections))
+    return SummedCells(
+        counts=counts,
+        log_mass=log_mass,
+        change=change / np.maximum(1.0 - change, 0.5),
+        mixture=TubeMixture.concatenate(parts),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _scale(weight: Any, mean: Any, noise: Any) -> Any:
+    """Lengths in the units of which boxes are halved: what the noise of an angle makes at the mean path length."""
+    length = 0.0
+    for i in range(len(weight)):
+        length += weight[i] * mean[i, 0]
+    angle = np.sqrt(noise[1])
+    scale = np.full(SIZE, max(length, 1e-3) * angle)
+    scale[0] *= 2.5  # tubes are straight along their length
+    scale[1] = angle
+    scale[2] = angle
+    return scale
+
+
+@numba.njit(cache=True, nogil=True)
+def _joint(k: Any, u_mean: Any, u_cov: Any, x_mean: Any, jacobian: Any, x_cov: Any, mean: Any, cov: Any) -> None:
+    """Mean and covariance of (u, x) of a stored component, with its widening."""
+    place = 0
+    for i in range(3):
+        mean[i], mean[3 + i] = u_mean[k, i], x_mean[k, i]
+        for j in range(i, 3):
+            cov[i, j] = u_cov[k, place]
+            cov[j, i] = u_cov[k, place]
+            cov[3 + i, 3 + j] = x_cov[k, place]
+            place += 1
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for m in range(3):
+                total += jacobian[k, i, m] * cov[m, j]
+            cov[3 + i, j] = total
+            cov[j, 3 + i] = total
+    for i in range(3):
+        for j in range(i, 3):
+            for m in range(3):
+                cov[3 + i, 3 + j] += cov[3 + i, m] * jacobian[k, j, m]
+            for a in range(1, 3):
+                for b in range(1, 3):
+                    products = cov[0, 0] * cov[a, b] + cov[0, a] * cov[0, b]
+                    cov[3 + i, 3 + j] += products * jacobian[k, i, a] * jacobian[k, j, b] / (mean[0] * mean[0])
+            cov[3 + j, 3 + i] = cov[3 + i, 3 + j]
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_cell(
+    azimuth: Any,
+    zenith: Any,
+    window: Any,
+    fine_window: Any,
+    ring_offsets: Any,
+    ring_cells: Any,
+    solid_angles: Any,
+    offsets: Any,
+    cell_log_mass: Any,
+    cell_change: Any,
+    log_weight: Any,
+    u_mean: Any,
+    u_cov: Any,
+    x_mean: Any,
+    jacobian: Any,
+    x_cov: Any,
+    num_reflections: Any,
+    noise: Any,
+    reach: Any,
+    max_divergence: Any,
+) -> Any:
+    """Sum the cells around a direction: log mass, change, weights, means, covariances and numbers of reflections."""
+    num_rings = len(ring_cells)
+    sine = np.sin(zenith)
+    vertical = window * window - fine_window * fine_window
+    far = reach * np.sqrt(vertical)
+    cells, logs, moved = [0], [0.0], [(0.0, 0.0, 0.0)]
+    cells.pop()
+    logs.pop()
+    moved.pop()
+    total = 0
+    first = max(0, int((zenith - far) / np.pi * num_rings))
+    last = min(num_rings - 1, int((zenith + far) / np.pi * num_rings))
+    for ring in range(first, last + 1):
+        ring_zenith = (ring + 0.5) * np.pi / num_rings
+        # A step of azimuth is longer in one cell's tangent plane than in the other's.
+        stretch = sine / np.sin(ring_zenith)
+        horizontal = max(window * window - (fine_window * stretch) ** 2, fine_window * fine_window)
+        down = ring_zenith - zenith
+        for step in range(ring_cells[ring]):
+            cell = ring_offsets[ring] + step
+            if offsets[cell] == offsets[cell + 1]:
+                continue
+            turn = -np.pi + (step + 0.5) * 2.0 * np.pi / ring_cells[ring] - azimuth
+            turn -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
+            across = sine * turn
+            square = across * across / horizontal + down * down / vertical
+            if square > reach * reach:
+                continue
+            cells.append(cell)
+            density = np.exp(-0.5 * square) / (2.0 * np.pi * np.sqrt(horizontal * vertical))
+            logs.append(np.log(density * solid_angles[ring]) + cell_log_mass[cell])
+            moved.append((across, down, stretch))
+            total += offsets[cell + 1] - offsets[cell]
+    weight, label = np.empty(total), np.empty(total, np.int8)
+    mean, cov = np.empty((total, SIZE)), np.empty((total, SIZE, SIZE))
+    if total == 0:
+        return -np.inf, 0.0, weight, mean, cov, label
+    top = max(logs)
+    place = 0
+    mass = 0.0
+    change = 0.0
+    for n in range(len(cells)):
+        across, down, stretch = moved[n]
+        share = np.exp(logs[n] - top)
+        mass += share
+        change += share * cell_change[cells[n]]
+        for k in range(offsets[cells[n]], offsets[cells[n] + 1]):
+            weight[place] = share * np.exp(np.float64(log_weight[k]))
+            label[place] = num_reflections[k]
+            _joint(k, u_mean, u_cov, x_mean, jacobian, x_cov, mean[place], cov[place])
+            mean[place, 1] = across + stretch * mean[place, 1]
+            mean[place, 2] += down
+            for i in range(SIZE):
+                cov[place, 1, i] *= stretch
+                cov[place, i, 1] *= stretch
+            place += 1
+    weight /= weight.sum()
+    # Of components that become one, the number of reflections of the heaviest stays.
+    heaviest = weight.copy()
+    scale, one_group = _scale(weight, mean, noise), np.zeros(total, np.int64)
+    into = halve_and_merge(weight, mean, cov, one_group, scale, noise, max_divergence)
+    for n in range(total):
+        if heaviest[n] > heaviest[into[n]]:
+            heaviest[into[n]], label[into[n]] = heaviest[n], label[n]
+    alive = into == np.arange(total)
+    return top + np.log(mass), change / mass, weight[alive], mean[alive], cov[alive], label[alive]

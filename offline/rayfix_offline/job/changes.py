@@ -1,0 +1,232 @@
+"""By how much the measures that cells are fitted to differ between two traces of a station.
+
+Rays of both traces start in the same directions, so they are compared one by one, piece by piece. A piece counts with
+the part of its mass that the other trace has not: all of it where the ray runs another course, ``|m - m'|`` where it
+runs the same course through other weights. A cell's change is the sum over its rays, weighted by its window, as a share
+of its mass: a bound on the L1 distance of the two measures. Cells whose pieces are the same to the last bit change by
+exactly 0, and their fit is the same to the last bit.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.fit.moments import CUTOFF, ring_span
+from rayfix_offline.rays.trace import LevelRays
+
+SAME_COURSE = 1e-6
+"""Reflection sequences whose mirror images and mirrors differ by less than this are the same, m and 1."""
+
+SMALLEST = float(np.finfo(np.float32).tiny)
+"""Change of a cell that is not the same to the last bit, at least: 0 stands for an exact one."""
+
+
+def cell_changes(old: LevelRays, new: LevelRays) -> NDArray[np.float64]:
+    """Compare the cells of a level between two traces.
+
+    Parameters
+    ----------
+    old, new : LevelRays
+        Of the same station, window and seed, in two scenes.
+
+    Returns
+    -------
+    ndarray of shape (n_cells,)
+        Change of each cell's measure as a share of its new mass; 0 where nothing at all has changed, inf where no ray
+        comes any longer, and everywhere if the rays do not start in the same directions.
+    """
+    if not np.array_equal(old.rays.directions, new.rays.directions):
+        return np.full(new.grid.num_cells, np.inf)
+    change, mass, same = ray_changes(old, new)
+    rays = new.rays
+    return np.asarray(
+        _sum_over_cells(
+            new.grid.centres,
+            new.window,
+            rays.grid.ring_offsets,
+            rays.grid.ring_cells,
+            rays.azimuth,
+            rays.zenith,
+            rays.solid_angle,
+            change,
+            mass,
+            same,
+        )
+    )
+
+
+def ray_changes(old: LevelRays, new: LevelRays) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Compare rays piece by piece.
+
+    Returns
+    -------
+    change : ndarray of shape (n_rays,), m3 / sr
+        Mass that only one of the traces has.
+    mass : ndarray of shape (n_rays,), m3 / sr
+        Mass in the new trace.
+    same : ndarray of bool, shape (n_rays,)
+        Whether all pieces are the same to the last bit.
+    """
+    a, b = old.pieces, new.pieces
+    change, mass, same = _compare(
+        a.offsets,
+        a.sequence,
+        a.slice,
+        a.mass,
+        a.mean,
+        a.variance,
+        old.sequences.images,
+        old.sequences.mirrors,
+        old.surface_sequences,
+        b.offsets,
+        b.sequence,
+        b.slice,
+        b.mass,
+        b.mean,
+        b.variance,
+        new.sequences.images,
+        new.sequences.mirrors,
+        new.surface_sequences,
+    )
+    return change, mass, same
+
+
+@numba.njit(cache=True, nogil=True)
+def _compare(
+    offsets_a: Any,
+    sequence_a: Any,
+    slice_a: Any,
+    mass_a: Any,
+    mean_a: Any,
+    variance_a: Any,
+    images_a: Any,
+    mirrors_a: Any,
+    surfaces_a: Any,
+    offsets_b: Any,
+    sequence_b: Any,
+    slice_b: Any,
+    mass_b: Any,
+    mean_b: Any,
+    variance_b: Any,
+    images_b: Any,
+    mirrors_b: Any,
+    surfaces_b: Any,
+) -> Any:
+    num_rays = len(offsets_b) - 1
+    change = np.zeros(num_rays)
+    mass = np.zeros(num_rays)
+    same = np.ones(num_rays, np.bool_)
+    # Sequences that the fit gathers in one scene and not in the other: facets of a surface that has become another.
+    partner_a, partner_b = np.full(len(images_a), -1), np.full(len(images_b), -1)
+    torn = np.zeros(len(images_b), np.bool_)
+    for ray in range(num_rays):
+        i, stop_i = offsets_a[ray], offsets_a[ray + 1]
+        j, stop_j = offsets_b[ray], offsets_b[ray + 1]
+        while i < stop_i or j < stop_j:
+            # The next straight stretch of the ray in either trace.
+            end_i, end_j = i, j
+            while end_i < stop_i and sequence_a[end_i] == sequence_a[i]:
+                end_i += 1
+            while end_j < stop_j and sequence_b[end_j] == sequence_b[j]:
+                end_j += 1
+            apart = np.inf
+            if i < end_i and j < end_j:
+                apart = _distance(
+                    images_a[sequence_a[i]], mirrors_a[sequence_a[i]], images_b[sequence_b[j]], mirrors_b[sequence_b[j]]
+                )
+            if apart != 0.0:
+                same[ray] = False
+            else:
+                whole_a, whole_b = surfaces_a[sequence_a[i]], surfaces_b[sequence_b[j]]
+                if partner_a[whole_a] < 0 and partner_b[whole_b] < 0:
+                    partner_a[whole_a], partner_b[whole_b] = whole_b, whole_a
+                elif partner_a[whole_a] != whole_b:
+                    torn[whole_b] = True
+                    if partner_a[whole_a] >= 0:
+                        torn[partner_a[whole_a]] = True
+            while i < end_i or j < end_j:
+                if apart <= SAME_COURSE and i < end_i and j < end_j and slice_a[i] == slice_b[j]:
+                    change[ray] += abs(mass_a[i] - mass_b[j])
+                    mass[ray] += mass_b[j]
+                    moved = abs(mean_a[i] - mean_b[j])
+                    if moved > 0.0:
+                        # The L1 distance of two normal densities is below their distance in standard deviations.
+                        deviation = np.sqrt(max(variance_a[i], variance_b[j]))
+                        change[ray] += min(mass_a[i], mass_b[j]) * (min(2.0, moved / deviation) if deviation else 2.0)
+                    if mass_a[i] != mass_b[j] or moved > 0.0 or variance_a[i] != variance_b[j]:
+                        same[ray] = False
+                    i += 1
+                    j += 1
+                elif j == end_j or (i < end_i and slice_a[i] < slice_b[j]):
+                    change[ray] += mass_a[i]
+                    same[ray] = False
+                    i += 1
+                else:
+                    change[ray] += mass_b[j]
+                    mass[ray] += mass_b[j]
+                    same[ray] = False
+                    j += 1
+    if torn.any():
+        for ray in range(num_rays):
+            for piece in range(offsets_b[ray], offsets_b[ray + 1]):
+                if torn[surfaces_b[sequence_b[piece]]]:
+                    same[ray] = False
+    return change, mass, same
+
+
+@numba.njit(cache=True, nogil=True)
+def _distance(image_a: Any, mirror_a: Any, image_b: Any, mirror_b: Any) -> Any:
+    """Largest difference between the images and mirrors of two reflection sequences."""
+    largest = 0.0
+    for row in range(3):
+        largest = max(largest, abs(image_a[row] - image_b[row]))
+        for column in range(3):
+            largest = max(largest, abs(mirror_a[row, column] - mirror_b[row, column]))
+    return largest
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_over_cells(
+    centres: Any,
+    window: Any,
+    ring_offsets: Any,
+    ring_cells: Any,
+    azimuth: Any,
+    zenith: Any,
+    solid_angle: Any,
+    change: Any,
+    mass: Any,
+    same: Any,
+) -> Any:
+    """Sum over the rays that a cell gathers; see :func:`rayfix_offline.fit.moments.gather_groups`."""
+    result = np.zeros(len(centres))
+    reach = CUTOFF * window
+    num_rings = len(ring_cells)
+    for cell in range(len(centres)):
+        centre_azimuth, centre_zenith = centres[cell]
+        sine = np.sin(centre_zenith)
+        changed, whole, identical = 0.0, 0.0, True
+        first_ring = max(0, int((centre_zenith - reach) / np.pi * num_rings))
+        last_ring = min(num_rings - 1, int((centre_zenith + reach) / np.pi * num_rings))
+        for ring in range(first_ring, last_ring + 1):
+            cells = ring_cells[ring]
+            begin, stop = ring_span(centre_azimuth, reach / sine, cells)
+            for step in range(begin, stop):
+                ray = ring_offsets[ring] + step % cells
+                turn = azimuth[ray] - centre_azimuth
+                turn -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
+                horizontal = sine * turn
+                vertical = zenith[ray] - centre_zenith
+                square = (horizontal * horizontal + vertical * vertical) / (window * window)
+                if square > CUTOFF * CUTOFF:
+                    continue
+                density = np.exp(-0.5 * square) * solid_angle[ray]
+                changed += density * change[ray]
+                whole += density * mass[ray]
+                identical = identical and same[ray]
+        if identical:
+            continue
+        result[cell] = max(changed / whole, SMALLEST) if whole > 0.0 else np.inf
+    return result

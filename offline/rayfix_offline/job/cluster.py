@@ -1,0 +1,208 @@
+"""Fit blocks of cells on a Dask cluster.
+
+Tasks carry the numbers of their cells only. A worker gets the scene and the site once, by content hash, and traces a
+station's rays when the first of its blocks arrives; a block fitted anywhere is the same to the last bit. When a worker
+is lost, Dask gives its blocks to the others.
+"""
+
+import threading
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from distributed import Client, as_completed
+from numpy.typing import NDArray
+
+from rayfix_offline.fit.cells import FittedCells, fit_cells, widen_cells
+from rayfix_offline.job.plan import BUILD_VERSION, Block, StationPlan
+from rayfix_offline.job.shards import content_key
+from rayfix_offline.rays.trace import StationTrace, level_grid, trace_station
+from rayfix_offline.scene.scene import Scene
+from rayfix_offline.site import SiteFile, parse_site
+from rayfix_offline.twin.twin import prepare_scene
+from rayfix_tables.errors import BuildError
+from rayfix_tables.level import Level
+
+CONNECT_SECONDS = 15
+"""How long a scheduler may take to answer."""
+
+RETRIES = 5
+"""How often a block may be lost with its worker."""
+
+TRACES_KEPT = 2
+"""Stations whose rays a worker keeps in memory; blocks come station by station."""
+
+_Task = tuple[Callable[..., dict[str, Any]], tuple[Any, ...]]
+
+_traces: "OrderedDict[str, StationTrace]" = OrderedDict()
+_lock = threading.Lock()
+
+
+class Cluster:
+    """A connection to a Dask scheduler. Use it as a context manager.
+
+    Parameters
+    ----------
+    address : str
+        E.g. ``tcp://10.0.0.5:8786``.
+
+    Raises
+    ------
+    BuildError
+        When no scheduler answers, or it has no workers.
+    """
+
+    def __init__(self, address: str, site: SiteFile, scene: Scene) -> None:
+        try:
+            self._client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise BuildError(
+                f"no Dask scheduler answers at {address}; start one with 'dask scheduler' and give its address"
+            ) from error
+        if not self._client.scheduler_info()["workers"]:
+            self._client.close()
+            raise BuildError(f"the Dask scheduler at {address} has no workers; start some with 'dask worker {address}'")
+        self._site, self._scene = site.model_dump(mode="json"), scene
+        self._inputs_id = content_key(self._site, scene.sha256)
+
+    def __enter__(self) -> "Cluster":
+        """Return the connection."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the connection; tasks that are under way are given up."""
+        self._client.close()
+
+    def launch(self, plan: StationPlan) -> dict[str, Any]:
+        """Trace a station's rays on a worker and return what :meth:`StationTrace.to_arrays` gives.
+
+        Raises
+        ------
+        BuildError
+            When it fails.
+        """
+        ((_, arrays),) = self._run(plan, {"launch": (_launch_remotely, ())})
+        return arrays
+
+    def fit_blocks(self, plan: StationPlan, blocks: list[Block]) -> Iterator[tuple[Block, FittedCells]]:
+        """Fit blocks of a station on all workers; they come back as they are ready.
+
+        Raises
+        ------
+        BuildError
+            When a block fails, or is lost with its worker too often.
+        """
+        by_name = {block.shard: block for block in blocks}
+        tasks = {name: (_fit_remotely, (block.cells,)) for name, block in by_name.items()}
+        for name, arrays in self._run(plan, tasks):
+            yield by_name[name], FittedCells.from_arrays(arrays)
+
+    def widen_blocks(
+        self, plan: StationPlan, blocks: list[Block], finer: Level, finer_change: NDArray[np.float32]
+    ) -> Iterator[tuple[Block, FittedCells]]:
+        """Make blocks of a wide level on all workers; they come back as they are ready.
+
+        Raises
+        ------
+        BuildError
+            When a block fails, or is lost with its worker too often.
+        """
+        if not blocks:
+            return
+        by_name = {block.shard: block for block in blocks}
+        with warnings.catch_warnings():
+            # The finer level goes to the scheduler once and from there to each worker, which is what is wanted.
+            warnings.simplefilter("ignore", UserWarning)
+            source = self._client.submit(
+                _hand_on, finer, finer_change, key=f"rayfix-{plan.part_id}-under-{blocks[0].level}"
+            )
+        tasks = {name: (_widen_remotely, (source, block.level, block.cells)) for name, block in by_name.items()}
+        for name, arrays in self._run(plan, tasks):
+            yield by_name[name], FittedCells.from_arrays(arrays)
+
+    def _run(self, plan: StationPlan, tasks: Mapping[str, _Task]) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Run tasks on the workers."""
+        # A task that hands the inputs on, and not data scattered to workers: Dask can repeat it when they are lost.
+        inputs = self._client.submit(_hand_on, self._site, self._scene, key=f"rayfix-inputs-{self._inputs_id}")
+        futures = {
+            self._client.submit(
+                run,
+                (plan.part_id, BUILD_VERSION, plan.station.id),
+                inputs,
+                *arguments,
+                key=f"rayfix-{plan.part_id}-{name}-{_fingerprint(arguments)}",
+                retries=RETRIES,
+            ): name
+            for name, (run, arguments) in tasks.items()
+        }
+        for future in as_completed(list(futures), loop=self._client.loop):
+            try:
+                arrays = future.result()
+            except BuildError:
+                raise
+            except Exception as error:  # whatever a worker of the cluster meets
+                raise BuildError(
+                    f"station '{plan.station.id}' could not be built on the cluster: {error}; finished blocks are "
+                    "kept, run the same build again to go on"
+                ) from error
+            yield futures[future], arrays
+            future.release()
+
+
+def _fingerprint(arguments: tuple[Any, ...]) -> str:
+    """Tell tasks of one block apart that fit different cells of it."""
+    return content_key([a.tolist() for a in arguments if isinstance(a, np.ndarray)])[:16]
+
+
+def _hand_on(*inputs: Any) -> tuple[Any, ...]:
+    """Hand inputs of many tasks on to the workers."""
+    return inputs
+
+
+def _fit_remotely(
+    part: tuple[str, int, str], inputs: tuple[dict[str, Any], Scene], cells: NDArray[np.int64]
+) -> dict[str, Any]:
+    """Fit a block on a worker."""
+    site = parse_site(inputs[0])
+    return fit_cells(cells, _trace(part, site, inputs[1]).finest, site).to_arrays()
+
+
+def _widen_remotely(
+    part: tuple[str, int, str],
+    inputs: tuple[dict[str, Any], Scene],
+    source: tuple[Level, NDArray[np.float32]],
+    level: int,
+    cells: NDArray[np.int64],
+) -> dict[str, Any]:
+    """Make a block of a wide level on a worker."""
+    _check_version(part[1])
+    window = float(np.deg2rad(parse_site(inputs[0]).table.windows_deg[level]))
+    return widen_cells(cells, window, level_grid(window), *source).to_arrays()
+
+
+def _launch_remotely(part: tuple[str, int, str], inputs: tuple[dict[str, Any], Scene]) -> dict[str, Any]:
+    """Trace a station's rays on a worker."""
+    return _trace(part, parse_site(inputs[0]), inputs[1]).to_arrays()
+
+
+def _trace(part: tuple[str, int, str], site: SiteFile, scene: Scene) -> StationTrace:
+    """Rays of a station, traced once on each worker."""
+    part_id, version, station_id = part
+    _check_version(version)
+    with _lock:
+        if part_id not in _traces:
+            (section,) = [s for s in site.stations if s.id == station_id]
+            _traces[part_id] = trace_station(section, site, prepare_scene(site, scene))
+            while len(_traces) > TRACES_KEPT:
+                _traces.popitem(last=False)
+        return _traces[part_id]
+
+
+def _check_version(version: int) -> None:
+    if version != BUILD_VERSION:
+        raise BuildError(
+            f"a worker builds tables of version {BUILD_VERSION}, this build needs {version}; install the same rayfix "
+            "on all workers"
+        )

@@ -1,0 +1,148 @@
+"""What a build has to do: the cells of each station in blocks, each part named by all that decides its content."""
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.fit import moments
+from rayfix_offline.fit.em import ExpectationMaximisation
+from rayfix_offline.fit.tubes import TubeFit
+from rayfix_offline.fit.wide_windows import CoarseFit
+from rayfix_offline.job.shards import content_key
+from rayfix_offline.rays import trace
+from rayfix_offline.rays.trace import level_grid
+from rayfix_offline.site import SiteFile, StationSection
+from rayfix_offline.twin import surfaces
+from rayfix_offline.twin.twin import Twin
+from rayfix_tables.angles import direction, local_to_scene
+from rayfix_tables.schema import FORMAT_VERSION
+from rayfix_tables.site import Station
+
+BUILD_VERSION = 4
+"""Raised with every change of the software that makes another table of the same site."""
+
+BLOCK_CELLS = 256
+"""Cells that one task fits and one shard holds."""
+
+WIDE_BLOCK_CELLS = 64
+"""The same for the levels whose cells are sums of others."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """Cells of one level that are fitted together.
+
+    Attributes
+    ----------
+    level : int
+    number : int
+        Counted within the level.
+    cells : ndarray of int64, shape (n,)
+    """
+
+    level: int
+    number: int
+    cells: NDArray[np.int64]
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Level and number."""
+        return self.level, self.number
+
+    @property
+    def shard(self) -> str:
+        """Last part of the name of the block's shard."""
+        return f"{self.level}-{self.number}"
+
+    def only(self, cells: NDArray[np.int64]) -> "Block":
+        """Return the block with some of its cells only."""
+        return dataclasses.replace(self, cells=cells)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationPlan:
+    """The part of a build that concerns one station.
+
+    Attributes
+    ----------
+    part_id : str
+        SHA-256 over all that decides the station's part of the table: scene, free space, propagation, table settings,
+        the station itself but for its bias, and the version of the software's method. Other stations do not count.
+    """
+
+    section: StationSection
+    station: Station
+    part_id: str
+    blocks: tuple[Block, ...]
+
+    @property
+    def finest_blocks(self) -> tuple[Block, ...]:
+        """Blocks that are fitted to rays."""
+        return tuple(block for block in self.blocks if block.level == 0)
+
+    @property
+    def num_finest_cells(self) -> int:
+        """Number of cells that are fitted to rays."""
+        return sum(len(block.cells) for block in self.finest_blocks)
+
+    @property
+    def num_cells(self) -> int:
+        """Number of cells to make."""
+        return sum(len(block.cells) for block in self.blocks)
+
+
+def plan_build(site: SiteFile, twin: Twin) -> tuple[StationPlan, ...]:
+    """Plan the build of a site."""
+    common = content_key(
+        BUILD_VERSION,
+        FORMAT_VERSION,
+        _method_settings(site, curved=twin.planes.curved),
+        twin.scene.sha256,
+        hashlib.sha256(np.packbits(twin.free_space.free).tobytes()).hexdigest(),
+        [*twin.free_space.origin.tolist(), twin.free_space.voxel_size, *twin.free_space.free.shape],
+        site.propagation.model_dump(mode="json"),
+        site.table.model_dump(mode="json"),
+    )
+    return tuple(
+        StationPlan(
+            section=section,
+            station=station,
+            part_id=content_key(common, section.built_from()),
+            blocks=_blocks(station, site),
+        )
+        for section, station in zip(site.stations, site.info().stations, strict=True)
+    )
+
+
+def updated_part_id(exact_part_id: str, former_part_id: str, tolerance: float) -> str:
+    """``part_id`` of a part some of whose cells were kept from a former part though they had changed a little."""
+    return content_key("updated", exact_part_id, former_part_id, tolerance)
+
+
+def _method_settings(site: SiteFile, *, curved: bool) -> dict[str, float | dict[str, float]]:
+    fit = TubeFit() if site.table.fit == "tubes" else ExpectationMaximisation(seed=site.table.seed)
+    constants = {
+        f"{module.__name__}.{name}": value
+        for module in ((moments, trace, surfaces) if curved else (moments, trace))
+        for name, value in vars(module).items()
+        if name.isupper() and isinstance(value, int | float)
+    }
+    return {**constants, "fit": dataclasses.asdict(fit), "coarse": dataclasses.asdict(CoarseFit())}
+
+
+def _blocks(station: Station, site: SiteFile) -> tuple[Block, ...]:
+    """Cells of each level whose centre lies in the station's field of view or hardly outside, in blocks."""
+    axis = local_to_scene(station.orientation)[:, 0]
+    blocks: list[Block] = []
+    for level, window in enumerate(np.deg2rad(site.table.windows_deg)):
+        centres = level_grid(float(window)).centres
+        angle = np.arccos(np.clip(direction(centres[:, 0], centres[:, 1]) @ axis, -1.0, 1.0))
+        cells = np.flatnonzero(angle <= 0.5 * station.field_of_view + window)
+        size = WIDE_BLOCK_CELLS if level else BLOCK_CELLS
+        blocks.extend(
+            Block(level=level, number=n, cells=cells[i : i + size]) for n, i in enumerate(range(0, len(cells), size))
+        )
+    return tuple(blocks)

@@ -1,0 +1,296 @@
+"""Launch rays from a station and follow them from mirror to mirror.
+
+Of every ray only lengths are kept: along one reflection sequence a ray runs on ``image + length * mirror @ direction``,
+where ``image`` is the station mirrored at the sequence's planes and ``mirror`` the product of their reflections. So a
+hit comes from one division, however many reflections went before, and nothing accumulates.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.rays.segments import Segments, Sequences
+from rayfix_offline.scene.engine import RayEngine
+from rayfix_offline.scene.materials import Reflectivity
+from rayfix_offline.twin.planes import Planes
+
+OFFSET = 1e-5
+"""A reflected ray starts this times (1 + largest coordinate) off its mirror, m."""
+
+
+def launch(
+    station: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    *,
+    engine: RayEngine,
+    planes: Planes,
+    reflectivity: Reflectivity,
+    bounds: NDArray[np.float64],
+    max_reflections: int,
+    max_path_length: float,
+) -> Segments:
+    """Launch rays and mirror them at what they hit.
+
+    Parameters
+    ----------
+    station : ndarray of shape (3,), m
+    directions : ndarray of shape (n_rays, 3)
+        Unit vectors.
+    reflectivity : Reflectivity
+        Of the engine's triangles.
+    bounds : ndarray of shape (2, 3), m
+        Low and high corner of the scene; a ray that hits nothing ends there.
+    max_path_length : float, m
+        Rays end at this unfolded length.
+    """
+    num_rays = len(directions)
+    offset = OFFSET * (1.0 + float(np.abs(bounds).max()))
+    sequence = np.full((num_rays, max_reflections + 1), -1, np.int32)
+    start = np.zeros(sequence.shape)
+    end = np.zeros(sequence.shape)
+    log_gain = np.zeros(sequence.shape)
+    sequence[:, 0] = 0
+    direct = np.array([-1], np.int32)
+    generations = [_Generation(parents=direct, planes=direct, images=station[None, :], mirrors=np.eye(3)[None])]
+
+    rays = np.arange(num_rays)
+    origins = np.broadcast_to(station.astype(np.float32), (num_rays, 3)).copy()
+    headings = directions.astype(np.float32)
+    first = 0
+    lost = 0
+    for depth in range(max_reflections + 1):
+        count = len(rays)
+        faces = engine.first_hit(origins, headings)
+        children = _Generation.of_at_most(count if depth < max_reflections else 0)
+        cosines = np.empty(count)
+        num_on, num_children, num_lost = _reflect(
+            depth,
+            faces,
+            rays,
+            directions,
+            planes.face_planes,
+            planes.normals,
+            planes.offsets,
+            bounds,
+            offset,
+            max_path_length,
+            first,
+            generations[-1].images,
+            generations[-1].mirrors,
+            children.parents,
+            children.planes,
+            children.images,
+            children.mirrors,
+            np.full(1 << (2 * max(1, len(children.parents))).bit_length(), -1, np.int32),
+            sequence,
+            start,
+            end,
+            cosines,
+            origins,
+            headings,
+        )
+        lost += num_lost
+        if depth == max_reflections:
+            break
+        first += len(generations[-1].parents)
+        generations.append(children.shortened(num_children))
+        rays, origins, headings = rays[:num_on], origins[:num_on], headings[:num_on]
+        loss = reflectivity.log_gain(faces[:num_on], cosines[:num_on])
+        log_gain[rays, depth + 1] = log_gain[rays, depth] + loss
+    return Segments(
+        sequence=sequence,
+        start=start,
+        end=end,
+        log_gain=log_gain,
+        sequences=Sequences(
+            images=np.concatenate([g.images for g in generations]),
+            mirrors=np.concatenate([g.mirrors for g in generations]),
+            parents=np.concatenate([g.parents for g in generations]),
+            planes=np.concatenate([g.planes for g in generations]),
+            num_reflections=np.repeat(np.arange(len(generations)), [len(g.parents) for g in generations]).astype(
+                np.int8
+            ),
+        ),
+        lost_ray_share=lost / max(1, num_rays),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Generation:
+    """Sequences of one number of reflections; fields as in :class:`Sequences`."""
+
+    parents: NDArray[np.int32]
+    planes: NDArray[np.int32]
+    images: NDArray[np.float64]
+    mirrors: NDArray[np.float64]
+
+    @classmethod
+    def of_at_most(cls, count: int) -> "_Generation":
+        """Make room; what is never written takes no memory."""
+        return cls(
+            parents=np.empty(count, np.int32),
+            planes=np.empty(count, np.int32),
+            images=np.empty((count, 3)),
+            mirrors=np.empty((count, 3, 3)),
+        )
+
+    def shortened(self, count: int) -> "_Generation":
+        """Copy the first sequences."""
+        return _Generation(
+            parents=self.parents[:count].copy(),
+            planes=self.planes[:count].copy(),
+            images=self.images[:count].copy(),
+            mirrors=self.mirrors[:count].copy(),
+        )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _reflect(
+    depth: Any,
+    faces: Any,
+    rays: Any,
+    directions: Any,
+    face_planes: Any,
+    normals: Any,
+    offsets: Any,
+    bounds: Any,
+    offset: Any,
+    max_path_length: Any,
+    first: Any,
+    images: Any,
+    mirrors: Any,
+    child_parents: Any,
+    child_planes: Any,
+    child_images: Any,
+    child_mirrors: Any,
+    table: Any,
+    sequence: Any,
+    start: Any,
+    end: Any,
+    cosines: Any,
+    origins: Any,
+    headings: Any,
+) -> Any:
+    """End the rays' pieces of one depth at what they hit, and mirror them there.
+
+    The rays that go on are moved to the front of ``faces``, ``rays``, ``cosines``, ``origins`` and ``headings``.
+
+    Parameters
+    ----------
+    faces : ndarray of int32, shape (n,)
+        What each ray hits, -1 for nothing.
+    rays : ndarray of int64, shape (n,)
+        Rows of ``directions``, ``sequence``, ``start`` and ``end``.
+    first : int
+        Number of the first sequence in ``images`` and ``mirrors``; their children follow on these.
+    child_parents, child_planes, child_images, child_mirrors : ndarray
+        Room for the children; none when there are no more reflections.
+    table : ndarray of int32, all -1
+        Room for a hash table of the children; its length is a power of two, larger than their number.
+
+    Returns
+    -------
+    num_on, num_children, num_lost : int
+        Rays that go on, sequences found, and rays that hit nothing.
+    """
+    num_on, num_children, num_lost = 0, 0, 0
+    next_first = first + len(images)
+    last = len(child_parents) == 0
+    for n in range(len(rays)):
+        ray = rays[n]
+        parent = sequence[ray, depth] - first
+        hx, hy, hz = turned(mirrors, parent, directions, ray)
+        length = start[ray, depth]
+        plane = -1
+        reach = 0.0
+        approach = 0.0
+        if faces[n] >= 0:
+            plane = face_planes[faces[n]]
+            nx, ny, nz = normals[plane, 0], normals[plane, 1], normals[plane, 2]
+            approach = nx * hx + ny * hy + nz * hz
+            height = offsets[plane] - (nx * images[parent, 0] + ny * images[parent, 1] + nz * images[parent, 2])
+            reach = height / approach
+        # A hit behind the ray's start is float32 noise at an edge: such a ray has slipped through and is lost.
+        hit = plane >= 0 and np.isfinite(reach) and reach > length
+        if not hit:
+            num_lost += 1
+            reach = max(length, _exit_length(images[parent], (hx, hy, hz), bounds))
+        end[ray, depth] = min(reach, max_path_length)
+        if last or not hit or reach >= max_path_length:
+            continue
+        place = _hashed(parent, plane) & (len(table) - 1)
+        child = table[place]
+        while child >= 0 and (child_parents[child] != parent + first or child_planes[child] != plane):
+            place = (place + 1) & (len(table) - 1)
+            child = table[place]
+        if child < 0:
+            child = num_children
+            num_children += 1
+            table[place] = child
+            child_parents[child] = parent + first
+            child_planes[child] = plane
+            _mirror_at(
+                normals[plane],
+                offsets[plane],
+                images[parent],
+                mirrors[parent],
+                child_images[child],
+                child_mirrors[child],
+            )
+        hx, hy, hz = turned(child_mirrors, child, directions, ray)
+        # The side the ray came from: against its old heading.
+        aside = -np.sign(approach) * offset
+        rays[num_on] = ray
+        faces[num_on] = faces[n]
+        cosines[num_on] = abs(approach)
+        sequence[ray, depth + 1] = next_first + child
+        start[ray, depth + 1] = reach
+        origins[num_on, 0] = child_images[child, 0] + reach * hx + aside * nx
+        origins[num_on, 1] = child_images[child, 1] + reach * hy + aside * ny
+        origins[num_on, 2] = child_images[child, 2] + reach * hz + aside * nz
+        headings[num_on, 0], headings[num_on, 1], headings[num_on, 2] = hx, hy, hz
+        num_on += 1
+    return num_on, num_children, num_lost
+
+
+@numba.njit(cache=True, nogil=True)
+def turned(mirrors: Any, sequence: Any, directions: Any, ray: Any) -> Any:
+    """Direction of a ray after the reflections of a sequence."""
+    x, y, z = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+    return (
+        mirrors[sequence, 0, 0] * x + mirrors[sequence, 0, 1] * y + mirrors[sequence, 0, 2] * z,
+        mirrors[sequence, 1, 0] * x + mirrors[sequence, 1, 1] * y + mirrors[sequence, 1, 2] * z,
+        mirrors[sequence, 2, 0] * x + mirrors[sequence, 2, 1] * y + mirrors[sequence, 2, 2] * z,
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _hashed(parent: Any, plane: Any) -> Any:
+    """Spread pairs of numbers over the integers (Fibonacci hashing)."""
+    return np.int64(
+        ((np.uint64(parent) << np.uint64(32)) ^ np.uint64(plane)) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(32)
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _mirror_at(normal: Any, offset: Any, image: Any, mirror: Any, new_image: Any, new_mirror: Any) -> None:
+    """Mirror an image and a mirror matrix at a plane."""
+    height = normal[0] * image[0] + normal[1] * image[1] + normal[2] * image[2] - offset
+    for i in range(3):
+        new_image[i] = image[i] - 2.0 * height * normal[i]
+        for j in range(3):
+            along = normal[0] * mirror[0, j] + normal[1] * mirror[1, j] + normal[2] * mirror[2, j]
+            new_mirror[i, j] = mirror[i, j] - 2.0 * along * normal[i]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _exit_length(image: Any, heading: Any, bounds: Any) -> Any:
+    """Length at which a ray leaves the scene's bounding box, m."""
+    length = np.inf
+    for i in range(3):
+        if heading[i] != 0.0:
+            length = min(length, (bounds[1 if heading[i] > 0.0 else 0, i] - image[i]) / heading[i])
+    return length

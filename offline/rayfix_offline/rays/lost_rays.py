@@ -1,0 +1,103 @@
+"""Where rays leave a scene: the share of a station's rays that escape, and where most of them do."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.rays.launch import launch
+from rayfix_offline.rays.rays import sample_rays
+from rayfix_offline.scene.materials import constant_reflectivity
+from rayfix_offline.site import StationSection
+from rayfix_offline.twin.twin import Twin
+
+LOST_RAYS_WARNING = 0.01
+"""More lost rays than this share mean that a scene has holes."""
+
+RAY_SPACING = 0.03
+"""Of the rays of the check, rad: 14,000 rays for each station."""
+
+MAX_LEGS = 4
+"""Legs of a ray that are looked at, whatever the site's number of reflections."""
+
+PLACE_SIZE = 0.5
+"""Escaping rays are counted in cubes of this size, m, to find where most escape."""
+
+ENDLESS = 1e9
+"""Longer than any path, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Escapes:
+    """Rays of a station that leave the scene.
+
+    Attributes
+    ----------
+    share : float
+        Of all rays, directly or after reflections.
+    side : str or None
+        Side of the bounding box that most of them leave by: "+x", "-x", and so on; None without any.
+    side_share : float
+        Of the escaping rays, those that do.
+    place : tuple of float or None
+        Where most of them cross the border of the scene's bounding box, m; None without any.
+    place_share : float
+        Of the escaping rays, those that do so within half a metre.
+    """
+
+    station_id: str
+    share: float
+    side: str | None
+    side_share: float
+    place: tuple[float, float, float] | None
+    place_share: float
+
+
+def find_escapes(station: StationSection, twin: Twin, *, max_reflections: int) -> Escapes:
+    """Launch some thousand rays from a station and see which never meet a surface.
+
+    Parameters
+    ----------
+    max_reflections : int
+        Rays are followed over this many reflections, but over no more than ``MAX_LEGS`` legs.
+    """
+    rays = sample_rays(RAY_SPACING, np.random.default_rng(0))
+    legs = min(max_reflections + 1, MAX_LEGS)
+    segments = launch(
+        np.array(station.position_m),
+        rays.directions,
+        engine=twin.engine,
+        planes=twin.planes,
+        reflectivity=constant_reflectivity(len(twin.scene.faces), loss_db=0.0),
+        bounds=twin.scene.bounds,
+        max_reflections=legs,
+        max_path_length=ENDLESS,
+    )
+    # One leg more than is looked at: a ray without it has left the scene before.
+    lost = np.flatnonzero(segments.sequence[:, legs] < 0)
+    share = len(lost) / len(rays)
+    if not len(lost):
+        return Escapes(station_id=station.id, share=share, side=None, side_share=0.0, place=None, place_share=0.0)
+    last = (segments.sequence[lost] >= 0).sum(axis=1) - 1
+    sequence, length = segments.sequence[lost, last], segments.end[lost, last]
+    heading = np.einsum("nij,nj->ni", segments.sequences.mirrors[sequence], rays.directions[lost])
+    ends = segments.sequences.images[sequence] + length[:, None] * heading
+    place, count = _densest(ends)
+    low, high = twin.scene.bounds
+    sides = np.argmin(np.concatenate([ends - low, high - ends], axis=1), axis=1)
+    side = int(np.bincount(sides, minlength=6).argmax())
+    return Escapes(
+        station_id=station.id,
+        share=share,
+        side="-+"[side // 3] + "xyz"[side % 3],
+        side_share=float(np.mean(sides == side)),
+        place=(float(place[0]), float(place[1]), float(place[2])),
+        place_share=count / len(lost),
+    )
+
+
+def _densest(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
+    """Mean and number of the points of the fullest cube."""
+    cube = np.unique(np.floor(points / PLACE_SIZE), axis=0, return_inverse=True)[1].reshape(-1)
+    fullest = np.bincount(cube).argmax()
+    return points[cube == fullest].mean(axis=0), int(np.count_nonzero(cube == fullest))

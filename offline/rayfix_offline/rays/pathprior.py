@@ -1,0 +1,144 @@
+"""The path-selection prior: which of the paths to a place a station reports.
+
+At a place x that paths k reach with power gains g_k, path k is reported with probability
+``pi_k(x) = g_k^beta / sum_j g_j^beta``. The sum is a voxel map, filled by all rays of an isotropic launch: a ray that
+stands for the solid angle dOmega fills ``s^2 dOmega ds`` of space between the lengths s and s + ds.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.rays.launch import turned
+from rayfix_offline.rays.rays import RaySet
+from rayfix_offline.rays.segments import Segments
+from rayfix_offline.rays.voxelwalk import GAUSS, new_crossings, over_ray_ranges, power, walk
+from rayfix_tables.freespace import FreeSpace
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathPrior:
+    """The sum of gain^beta over all paths to a voxel.
+
+    Attributes
+    ----------
+    origin : ndarray of shape (3,), m
+    voxel_size : float, m
+    total : ndarray of shape (nx, ny, nz)
+        Mean over the voxel's free part; 0 where no ray comes.
+    coverage : tuple of float
+        Share of the free voxels that are reached with at most 0, 1, 2, ... reflections.
+    """
+
+    origin: NDArray[np.float64]
+    voxel_size: float
+    total: NDArray[np.float64]
+    coverage: tuple[float, ...]
+
+
+def reflection_factors(segments: Segments, exponent: float) -> NDArray[np.float64]:
+    """Factor that reflections put on gain^beta, shape (n_rays, max_reflections + 1)."""
+    return np.asarray(10.0 ** (segments.log_gain * exponent))
+
+
+def fill_path_prior(
+    rays: RaySet, segments: Segments, free_space: FreeSpace, *, exponent: float, refinement: int, jobs: int = 1
+) -> PathPrior:
+    """Fill the voxel map of one station.
+
+    Parameters
+    ----------
+    exponent : float
+        beta; 0 takes any path for as likely, a large one only the strongest.
+    refinement : int
+        A voxel of the map is this many voxels of the free space wide.
+    jobs : int
+        Threads; -1 for one per core. The map is the same with any number.
+    """
+    voxel_size = free_space.voxel_size * refinement
+    shape = -(-np.array(free_space.free.shape) // refinement)
+    padded = np.zeros(shape * refinement, bool)
+    nx, ny, nz = free_space.free.shape
+    padded[:nx, :ny, :nz] = free_space.free
+    blocks = padded.reshape(shape[0], refinement, shape[1], refinement, shape[2], refinement)
+    free_share = blocks.mean(axis=(1, 3, 5))
+    depths = segments.sequence.shape[1]
+    factors = reflection_factors(segments, exponent)
+
+    def fill(first: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+        total = np.zeros(tuple(shape))
+        first_reached = np.full(total.shape, depths, np.int8)
+        _fill(
+            segments.sequence[first:stop],
+            segments.start[first:stop],
+            segments.end[first:stop],
+            segments.sequences.images,
+            segments.sequences.mirrors,
+            rays.directions[first:stop],
+            rays.solid_angle[first:stop],
+            factors[first:stop],
+            exponent,
+            free_space.origin,
+            voxel_size,
+            total.shape,
+            *new_crossings(total.shape),
+            total.reshape(-1),
+            first_reached.reshape(-1),
+        )
+        return total, first_reached
+
+    filled = over_ray_ranges(fill, len(rays), jobs)
+    gain = sum((total for total, _ in filled[1:]), start=filled[0][0])
+    first_reached = np.min([reached for _, reached in filled], axis=0)
+    # A voxel that a solid cuts is lit over its free part only; at least one free-space voxel's worth.
+    total = gain / voxel_size**3 / np.maximum(free_share, 1.0 / refinement**3)
+    free = free_share > 0.5
+    count = max(1, int(np.count_nonzero(free)))
+    coverage = tuple(float(np.count_nonzero(free & (first_reached <= k)) / count) for k in range(depths))
+    return PathPrior(origin=free_space.origin, voxel_size=voxel_size, total=total, coverage=coverage)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fill(
+    sequence: Any,
+    start: Any,
+    end: Any,
+    images: Any,
+    mirrors: Any,
+    directions: Any,
+    solid_angle: Any,
+    factors: Any,
+    exponent: Any,
+    origin: Any,
+    voxel: Any,
+    shape: Any,
+    lengths: Any,
+    voxels: Any,
+    total: Any,
+    reached: Any,
+) -> None:
+    """Add the integral of solid angle x length^2 x gain^beta to each voxel."""
+    for ray in range(sequence.shape[0]):
+        for depth in range(sequence.shape[1]):
+            seq = sequence[ray, depth]
+            if seq < 0:
+                break
+            heading = turned(mirrors, seq, directions, ray)
+            scale = solid_angle[ray] * factors[ray, depth]
+            num_parts = walk(
+                images[seq], heading, start[ray, depth], end[ray, depth], origin, voxel, shape, lengths, voxels
+            )
+            for part in range(num_parts):
+                place, begin = voxels[part], lengths[part]
+                size = lengths[part + 1] - begin
+                if place < 0 or size <= 0.0:
+                    continue
+                for share, portion in GAUSS:
+                    length = begin + share * size
+                    # Bounded next to the station, where a voxel's mean gain has no limit.
+                    reach = max(length, 0.5 * voxel)
+                    total[place] += scale * portion * size * length * length / power(reach * reach, exponent)
+                reached[place] = min(reached[place], depth)

@@ -1,0 +1,278 @@
+"""Ray pieces: every ray cut into overlapping slices of length, with the weight and moments of each slice.
+
+The nodes of the slices are lengths in a constant ratio. A slice has the shape of a hat: it rises from the previous
+node to its own and falls to the next, so that slices add up to one everywhere. Moment-matched Gaussians of hats add
+up to a nearly flat density along a long ray (ripple 8 %), where those of abutting boxes leave deep valleys (39 %).
+
+A piece is shared by all cells of all levels whose window the ray lies in.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.rays.launch import turned
+from rayfix_offline.rays.pathprior import PathPrior, reflection_factors
+from rayfix_offline.rays.rays import RaySet
+from rayfix_offline.rays.segments import Segments
+from rayfix_offline.rays.voxelwalk import GAUSS, new_crossings, over_ray_ranges, power, walk
+
+FIRST_NODE = 0.25
+"""Length of the first slice node, m; whatever is nearer belongs to it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pieces:
+    """Pieces of all rays; those of ray r are ``offsets[r]`` to ``offsets[r + 1]``.
+
+    Attributes
+    ----------
+    sequence : ndarray of int32, shape (n_pieces,)
+    slice : ndarray of int16, shape (n_pieces,)
+    mass : ndarray of shape (n_pieces,), m3 / sr
+        Integral of s^2 pi over the length, times the hat.
+    mean : ndarray of shape (n_pieces,), m
+        Mean path length under that weight.
+    variance : ndarray of shape (n_pieces,), m2
+    """
+
+    offsets: NDArray[np.int64]
+    sequence: NDArray[np.int32]
+    slice: NDArray[np.int16]
+    mass: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+    @cached_property
+    def num_slices(self) -> int:
+        """Number of slices that occur, counted from the station."""
+        return int(self.slice.max(initial=-1)) + 1
+
+    def of_rays(self, index: NDArray[np.int64]) -> "Pieces":
+        """Pieces of chosen rays, in the order of ``index``."""
+        counts = self.offsets[index + 1] - self.offsets[index]
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        take = np.repeat(self.offsets[index] - offsets[:-1], counts) + np.arange(offsets[-1])
+        return Pieces(
+            offsets=offsets,
+            sequence=self.sequence[take],
+            slice=self.slice[take],
+            mass=self.mass[take],
+            mean=self.mean[take],
+            variance=self.variance[take],
+        )
+
+
+def cut_pieces(
+    rays: RaySet,
+    segments: Segments,
+    prior: PathPrior,
+    *,
+    exponent: float,
+    kind: Literal["power", "uniform", "paper"],
+    slice_ratio: float,
+    jobs: int = 1,
+) -> Pieces:
+    """Cut rays into pieces.
+
+    Parameters
+    ----------
+    exponent : float
+        The prior's beta.
+    kind : {"power", "uniform", "paper"}
+        Weight along a ray: s^2 pi, s^2, or 1.
+    slice_ratio : float
+        Ratio of a slice's node to the one before.
+    jobs : int
+        Threads; -1 for one per core. The pieces are the same with any number.
+    """
+    nodes = slice_nodes(float(segments.end.max(initial=0.0)), slice_ratio)
+    counts = _count(segments.sequence, segments.start, segments.end, nodes)
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    total = int(offsets[-1])
+    pieces = Pieces(
+        offsets=offsets,
+        sequence=np.empty(total, np.int32),
+        slice=np.empty(total, np.int16),
+        mass=np.zeros(total),
+        mean=np.zeros(total),
+        variance=np.zeros(total),
+    )
+    factors = reflection_factors(segments, exponent)
+
+    def cut(first: int, stop: int) -> None:
+        _cut(
+            segments.sequence[first:stop],
+            segments.start[first:stop],
+            segments.end[first:stop],
+            segments.sequences.images,
+            segments.sequences.mirrors,
+            rays.directions[first:stop],
+            factors[first:stop],
+            exponent,
+            kind != "paper",
+            kind == "power",
+            prior.origin,
+            prior.voxel_size,
+            prior.total.shape,
+            prior.total.reshape(-1),
+            *new_crossings(prior.total.shape),
+            nodes,
+            offsets[first:stop],
+            pieces.sequence,
+            pieces.slice,
+            pieces.mass,
+            pieces.mean,
+            pieces.variance,
+        )
+
+    over_ray_ranges(cut, len(rays), jobs)
+    return pieces
+
+
+def slice_nodes(longest: float, slice_ratio: float) -> NDArray[np.float64]:
+    """Lengths at which slices peak, up to the first beyond ``longest``, m."""
+    count = int(np.ceil(np.log(max(longest / FIRST_NODE, 1.0)) / np.log(slice_ratio))) + 2
+    return np.asarray(FIRST_NODE * slice_ratio ** np.arange(count))
+
+
+@numba.njit(cache=True, nogil=True)
+def _last_slice(length: Any, nodes: Any, at_least: Any) -> Any:
+    """Last slice that a length belongs to: the first one whose node lies beyond it."""
+    n = at_least
+    while nodes[n] < length:
+        n += 1
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def _count(sequence: Any, start: Any, end: Any, nodes: Any) -> Any:
+    """Pieces of each ray: one for each slice that a segment has a part in."""
+    counts = np.zeros(sequence.shape[0], np.int64)
+    for ray in range(sequence.shape[0]):
+        last = 0
+        for depth in range(sequence.shape[1]):
+            if sequence[ray, depth] < 0:
+                break
+            first = max(0, _last_slice(start[ray, depth], nodes, last) - 1)
+            last = _last_slice(end[ray, depth], nodes, first)
+            counts[ray] += last - first + 1
+    return counts
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _cut(
+    sequence: Any,
+    start: Any,
+    end: Any,
+    images: Any,
+    mirrors: Any,
+    directions: Any,
+    factors: Any,
+    exponent: Any,
+    by_volume: Any,
+    by_gain: Any,
+    origin: Any,
+    voxel: Any,
+    shape: Any,
+    total: Any,
+    lengths: Any,
+    voxels: Any,
+    nodes: Any,
+    offsets: Any,
+    out_sequence: Any,
+    out_slice: Any,
+    out_mass: Any,
+    out_mean: Any,
+    out_variance: Any,
+) -> None:
+    for ray in range(sequence.shape[0]):
+        at = offsets[ray]
+        last = 0
+        for depth in range(sequence.shape[1]):
+            seq = sequence[ray, depth]
+            if seq < 0:
+                break
+            begin, stop = start[ray, depth], end[ray, depth]
+            first = max(0, _last_slice(begin, nodes, last) - 1)
+            last = _last_slice(stop, nodes, first)
+            for n in range(first, last + 1):
+                out_sequence[at + n - first] = seq
+                out_slice[at + n - first] = n
+            heading = turned(mirrors, seq, directions, ray)
+            num_parts = walk(images[seq], heading, begin, stop, origin, voxel, shape, lengths, voxels)
+            peak = _last_slice(begin, nodes, first)  # the slice that rises where the walk is
+            low = nodes[peak - 1] if peak > 0 else 0.0
+            sum0, sum1, sum2, sum3 = 0.0, 0.0, 0.0, 0.0  # moments about the last node, before the hats
+            length = begin
+            for part in range(num_parts):
+                # The path's probability, times length^(2 beta) and before it is capped to 1. A path so weak that its
+                # gain^beta is 0 is never reported, and outside of the map there is no place to be.
+                probability = 0.0
+                if voxels[part] >= 0 and factors[ray, depth] > 0.0:
+                    probability = factors[ray, depth] / total[voxels[part]]  # infinite where the map is 0
+                while length < lengths[part + 1]:
+                    reach = min(lengths[part + 1], nodes[peak])
+                    for share, portion in GAUSS:
+                        middle = length + share * (reach - length)
+                        weight = portion * (reach - length) * (middle * middle if by_volume else 1.0)
+                        if by_gain:
+                            weight *= min(1.0, probability / power(middle * middle, exponent))
+                        above = middle - low
+                        sum0 += weight
+                        sum1 += weight * above
+                        sum2 += weight * above * above
+                        sum3 += weight * above * above * above
+                    length = reach
+                    if length == nodes[peak] or length == stop:
+                        _share_out(
+                            peak, nodes, sum0, sum1, sum2, sum3, at + peak - first, out_mass, out_mean, out_variance
+                        )
+                        sum0, sum1, sum2, sum3 = 0.0, 0.0, 0.0, 0.0
+                        low = nodes[peak]
+                        peak += 1
+            for n in range(first, last + 1):
+                i = at + n - first
+                if out_mass[i] > 0.0:
+                    off = out_mean[i] / out_mass[i]
+                    out_mean[i] = nodes[n] + off
+                    out_variance[i] = max(0.0, out_variance[i] / out_mass[i] - off * off)
+            at += last - first + 1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _share_out(
+    peak: Any,
+    nodes: Any,
+    sum0: Any,
+    sum1: Any,
+    sum2: Any,
+    sum3: Any,
+    i: Any,
+    out_mass: Any,
+    out_mean: Any,
+    out_variance: Any,
+) -> None:
+    """Share what lies between two nodes between the slice that rises there, piece i, and the one that falls.
+
+    The sums are moments about the lower node; those of each piece are taken about its own node.
+    """
+    if peak == 0:
+        # The first slice takes all before its node.
+        node = nodes[0]
+        out_mass[i] += sum0
+        out_mean[i] += sum1 - node * sum0
+        out_variance[i] += sum2 - 2.0 * node * sum1 + node * node * sum0
+        return
+    width = nodes[peak] - nodes[peak - 1]
+    rising0, rising1, rising2 = sum1 / width, sum2 / width, sum3 / width
+    out_mass[i] += rising0
+    out_mean[i] += rising1 - width * rising0
+    out_variance[i] += rising2 - 2.0 * width * rising1 + width * width * rising0
+    out_mass[i - 1] += sum0 - rising0
+    out_mean[i - 1] += sum1 - rising1
+    out_variance[i - 1] += sum2 - rising2

@@ -1,0 +1,172 @@
+"""All rays of one station, traced once and cut into the pieces that the cells of its finest level share."""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.rays.launch import launch
+from rayfix_offline.rays.pathprior import fill_path_prior
+from rayfix_offline.rays.pieces import Pieces, cut_pieces
+from rayfix_offline.rays.rays import RaySet, sample_rays
+from rayfix_offline.rays.segments import Segments, Sequences
+from rayfix_offline.rays.surface_sequences import surface_sequences
+from rayfix_offline.scene.materials import Reflectivity, constant_reflectivity, itu_reflectivity
+from rayfix_offline.site import SiteFile, StationSection
+from rayfix_offline.twin.twin import Twin
+from rayfix_tables.grid import AngularGrid
+
+RAYS_PER_WINDOW = 3.0
+"""Rays lie this many times as close as the finest window's standard deviation."""
+
+CELLS_PER_WINDOW = 0.8
+"""Cells are this many times as close as their window's standard deviation."""
+
+SLICE_RATIO = 1.2
+"""Ratio of a slice's length to the one before."""
+
+PRIOR_REFINEMENT = 2
+"""A voxel of the path prior is this many voxels of the free space wide."""
+
+PRIOR_RAYS = 0.7
+"""At the far end of the scene, the rays that fill the path prior lie this many of its voxels apart, or closer."""
+
+PRIOR_SPACING = 0.0073
+"""Rays that are launched for the path prior's sake need not lie closer than this, rad."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelRays:
+    """What the cells of a level are fitted to.
+
+    Attributes
+    ----------
+    window : float, rad
+        Standard deviation of the cells' window.
+    ray_spacing : float, rad
+    surface_sequences : ndarray of int64, shape (n_sequences,)
+        First of the sequences that run over the same surfaces as each one does; their groups are joined.
+    """
+
+    window: float
+    grid: AngularGrid
+    rays: RaySet
+    ray_spacing: float
+    pieces: Pieces
+    sequences: Sequences
+    surface_sequences: NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationTrace:
+    """A station's rays and what the launch found out.
+
+    Attributes
+    ----------
+    finest : LevelRays
+        For the finest level; the cells of the others are sums of its cells.
+    lost_ray_share : float
+        Share of the rays that left the scene instead of hitting a surface.
+    coverage : tuple of float
+        Share of the free space that is reached with at most 0, 1, 2, ... reflections.
+    """
+
+    finest: LevelRays
+    lost_ray_share: float
+    coverage: tuple[float, ...]
+
+    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
+        """Return what the launch found out, as the arrays of a shard."""
+        return {"lost_ray_share": np.array(self.lost_ray_share), "coverage": np.array(self.coverage)}
+
+
+def level_grid(window: float) -> AngularGrid:
+    """Grid of the cells of a window [rad]."""
+    return AngularGrid.from_spacing(window / CELLS_PER_WINDOW)
+
+
+def prior_spacing(twin: Twin) -> float:
+    """Largest spacing of the rays that fill a site's path prior, rad."""
+    far = float(np.linalg.norm(twin.scene.bounds[1] - twin.scene.bounds[0]))
+    return max(PRIOR_SPACING, PRIOR_RAYS * PRIOR_REFINEMENT * twin.free_space.voxel_size / far)
+
+
+def reflectivity_of(site: SiteFile, twin: Twin) -> Reflectivity:
+    """Return what the triangles of a site's scene reflect."""
+    propagation, scene = site.propagation, twin.scene
+    if propagation.reflection == "constant":
+        return constant_reflectivity(len(scene.faces), loss_db=propagation.reflection_loss_db)
+    return itu_reflectivity(
+        scene.face_materials,
+        scene.materials,
+        carrier_ghz=propagation.carrier_ghz,
+        loss_db=propagation.reflection_loss_db,
+    )
+
+
+def trace_station(station: StationSection, site: SiteFile, twin: Twin, *, jobs: int = 1) -> StationTrace:
+    """Launch a station's rays and cut them into pieces.
+
+    The directions depend on the site's seed and the station's id alone.
+
+    Parameters
+    ----------
+    jobs : int
+        Threads; -1 for one per core. The trace is the same with any number.
+    """
+    window = float(np.deg2rad(site.table.windows_deg[0]))
+    spacing = window / RAYS_PER_WINDOW
+    name = int.from_bytes(hashlib.sha256(station.id.encode()).digest()[:8], "big")
+    rays, segments = launch_rays(station, site, twin, spacing, np.random.default_rng([site.table.seed, name]))
+    prior_rays, prior_segments = rays, segments
+    if spacing > prior_spacing(twin):
+        rng = np.random.default_rng([site.table.seed, name, 1])
+        prior_rays, prior_segments = launch_rays(station, site, twin, prior_spacing(twin), rng)
+    exponent = site.propagation.path_prior_exponent
+    prior = fill_path_prior(
+        prior_rays, prior_segments, twin.free_space, exponent=exponent, refinement=PRIOR_REFINEMENT, jobs=jobs
+    )
+    pieces = cut_pieces(
+        rays,
+        segments,
+        prior,
+        exponent=exponent,
+        kind=site.propagation.path_prior,
+        slice_ratio=SLICE_RATIO,
+        jobs=jobs,
+    )
+    finest = LevelRays(
+        window=window,
+        grid=level_grid(window),
+        rays=rays,
+        ray_spacing=spacing,
+        pieces=pieces,
+        sequences=segments.sequences,
+        surface_sequences=surface_sequences(segments.sequences, twin.planes),
+    )
+    return StationTrace(finest=finest, lost_ray_share=prior_segments.lost_ray_share, coverage=prior.coverage)
+
+
+def launch_rays(
+    station: StationSection, site: SiteFile, twin: Twin, spacing: float, rng: np.random.Generator
+) -> tuple[RaySet, Segments]:
+    """Launch a station's rays.
+
+    Parameters
+    ----------
+    spacing : float, rad
+        Between neighbouring rays.
+    """
+    rays = sample_rays(spacing, rng)
+    segments = launch(
+        np.array(station.position_m),
+        rays.directions,
+        engine=twin.engine,
+        planes=twin.planes,
+        reflectivity=reflectivity_of(site, twin),
+        bounds=twin.scene.bounds,
+        max_reflections=site.propagation.max_reflections,
+        max_path_length=site.propagation.max_path_length_m,
+    )
+    return rays, segments

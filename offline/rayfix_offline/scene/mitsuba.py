@@ -1,0 +1,202 @@
+"""Mitsuba XML scenes, as Sionna RT and Blender's Mitsuba exporter write them.
+
+Of the format, what a building needs: shapes of type ``ply`` with ``to_world`` transforms, and the names of their
+materials. Sionna RT 1 says ``<bsdf type="itu-radio-material">`` with a ``type``; before, and from Blender, it is any
+bsdf whose id is like ``mat-itu_concrete``. Cameras, lights and integrators are passed over.
+"""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from trimesh.visual.material import PBRMaterial
+
+from rayfix_offline.scene.materials import itu_name
+from rayfix_offline.scene.placed import Placed
+from rayfix_tables.errors import SceneError
+
+_LARGEST = 1e9
+_UNREADABLE = "export the scene again, with a Mitsuba exporter"
+
+
+def read_mitsuba(path: Path, load_mesh: Callable[[Path], Any]) -> list[Placed]:
+    """Read the shapes of a Mitsuba scene.
+
+    Parameters
+    ----------
+    load_mesh : callable
+        Reads a mesh file as a ``trimesh.Scene``.
+
+    Returns
+    -------
+    list of (name, mesh, transform)
+        The mesh's material bears the name of the shape's, ``itu_concrete`` for whatever stands for it.
+
+    Raises
+    ------
+    SceneError
+        When the file or one of its meshes cannot be read, or holds what is not supported.
+    """
+    root = _parse(path)
+    defaults = {element.get("name", ""): element.get("value", "") for element in root.iter("default")}
+    for element in root.iter():
+        for key, value in element.attrib.items():
+            if "$" in value:
+                element.set(key, _substitute(value, defaults))
+    if root.find("include") is not None:
+        raise SceneError(f"{path} includes another file, which is not supported; export the scene as one file")
+    materials = {element.get("id", ""): _material_name(element) for element in root.iter("bsdf")}
+    placed: list[Placed] = []
+    for number, shape in enumerate(root.iter("shape"), 1):
+        name = (shape.get("id") or shape.get("name") or f"shape {number}").removeprefix("mesh-")
+        where = f"{path}, shape '{name}'"
+        kind = shape.get("type", "")
+        if kind != "ply":
+            raise SceneError(f"{where} is of type '{kind}', which is not supported; export it as ply")
+        transform = _to_world(shape, where)
+        material = _shape_material(shape, materials, where)
+        for mesh in _meshes(path, shape, load_mesh, where):
+            if material is not None:
+                mesh.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(name=material))
+            placed.append((name, mesh, transform))
+    return placed
+
+
+def _parse(path: Path) -> ElementTree.Element:
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read ({error.strerror}); correct 'scene' in the site file") from error
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path} cannot be read as XML: it is not UTF-8; {_UNREADABLE}") from error
+    # Entities can grow without bound and name other files; no exporter writes them.
+    if re.search("<!(DOCTYPE|ENTITY)", text, re.IGNORECASE):
+        raise SceneError(f"{path} declares a document type or entities, which is not allowed; remove <!DOCTYPE ...>")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise SceneError(f"{path} cannot be read as XML ({error}); {_UNREADABLE}") from error
+    if root.tag != "scene":
+        raise SceneError(f"{path} is no Mitsuba scene: its root is <{root.tag[:50]}> and not <scene>; {_UNREADABLE}")
+    return root
+
+
+def _substitute(value: str, defaults: dict[str, str]) -> str:
+    # Once, and not in what comes in: defaults that name each other could grow without bound.
+    return re.sub(r"\$(\w+)", lambda match: defaults.get(match[1], match[0]), value)
+
+
+def _material_name(bsdf: ElementTree.Element) -> str | None:
+    """Name of a bsdf's material, None when it bears none."""
+    for element in bsdf.iter("bsdf"):
+        if element.get("type") == "itu-radio-material":
+            kind = element.find("string[@name='type']")
+            if kind is not None and kind.get("value"):
+                return f"itu_{kind.get('value')}"
+    names = [element.get("id") or element.get("name") for element in bsdf.iter("bsdf")]
+    for name in names:
+        known = itu_name(name) if name else None
+        if known:
+            return f"itu_{known}"
+    return next((name.removeprefix("mat-") for name in names if name), None)
+
+
+def _shape_material(shape: ElementTree.Element, materials: dict[str, str | None], where: str) -> str | None:
+    own = shape.find("bsdf")
+    if own is not None:
+        return _material_name(own)
+    for reference in shape.findall("ref"):
+        if reference.get("name", "bsdf") != "bsdf":
+            continue
+        target = reference.get("id", "")
+        if target not in materials:
+            raise SceneError(
+                f"{where} refers to the material '{target}', which the file does not define; add its <bsdf>"
+            )
+        return materials[target]
+    return None
+
+
+def _meshes(path: Path, shape: ElementTree.Element, load_mesh: Callable[[Path], Any], where: str) -> list[Any]:
+    """Triangle meshes of a shape's file."""
+    element = shape.find("string[@name='filename']")
+    if element is None or not element.get("value"):
+        raise SceneError(f'{where} names no file; add <string name="filename" value="....ply"/>')
+    file = path.parent / str(element.get("value"))
+    try:
+        found = file.is_file()
+    except OSError:
+        found = False
+    if not found:
+        raise SceneError(f"{where} needs {element.get('value')}, which is not there; put it beside the scene file")
+    loaded = load_mesh(file)
+    meshes = [mesh for mesh in loaded.geometry.values() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    if not meshes:
+        raise SceneError(f"{where}: {element.get('value')} holds no triangles; export it as a triangle mesh")
+    return meshes
+
+
+def _to_world(shape: ElementTree.Element, where: str) -> NDArray[np.float64]:
+    """Transform of a shape, shape (4, 4): its operations one after the other."""
+    transform = np.eye(4)
+    for element in shape.findall("transform"):
+        if element.get("name") not in ("to_world", "toWorld"):
+            continue
+        for operation in element:
+            transform = _operation(operation, where) @ transform
+            if not np.abs(transform).max() < _LARGEST:
+                raise SceneError(f"{where} has a transform with numbers beyond {_LARGEST:g}; export the scene again")
+    if not np.array_equal(transform[3], (0.0, 0.0, 0.0, 1.0)):
+        raise SceneError(f"{where} has a perspective transform; give its matrix the last row 0 0 0 1")
+    return transform
+
+
+def _operation(element: ElementTree.Element, where: str) -> NDArray[np.float64]:
+    """Matrix of one element of a transform, shape (4, 4)."""
+    out = np.eye(4)
+    if element.tag == "translate":
+        out[:3, 3] = _vector(element, where, missing=0.0)
+    elif element.tag == "scale":
+        out[:3, :3] = np.diag(_vector(element, where, missing=1.0))
+    elif element.tag == "rotate":
+        axis = _vector(element, where, missing=0.0)
+        length = np.linalg.norm(axis)
+        if not length > 0.0:
+            raise SceneError(f"{where} is rotated about no axis; give x, y or z a value in <rotate>")
+        angle = np.deg2rad(_numbers(element.get("angle", ""), where, (1,))[0])
+        out = np.asarray(trimesh.transformations.rotation_matrix(angle, axis / length))
+    elif element.tag == "matrix":
+        values = _numbers(element.get("value", ""), where, (9, 16))
+        size = 3 if len(values) == 9 else 4
+        out[:size, :size] = values.reshape(size, size)
+    else:
+        raise SceneError(
+            f"{where} has the transform <{element.tag}>, which is not supported; use matrix, translate, scale or rotate"
+        )
+    return out
+
+
+def _vector(element: ElementTree.Element, where: str, *, missing: float) -> NDArray[np.float64]:
+    """Vector of an element, from its ``value`` or its ``x``, ``y`` and ``z``."""
+    value = element.get("value")
+    if value is not None:
+        return np.broadcast_to(_numbers(value, where, (1, 3)), 3)
+    return np.concatenate([_numbers(element.get(axis, str(missing)), where, (1,)) for axis in "xyz"])
+
+
+def _numbers(text: str, where: str, counts: tuple[int, ...]) -> NDArray[np.float64]:
+    try:
+        numbers = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        numbers = np.zeros(0)
+    if len(numbers) not in counts or not np.all(np.abs(numbers) < _LARGEST):
+        expected = " or ".join(str(count) for count in counts)
+        raise SceneError(
+            f"{where} has a transform with the value '{text[:60]}'; give {expected} finite numbers below {_LARGEST:g}"
+        )
+    return numbers

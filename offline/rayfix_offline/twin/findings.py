@@ -1,0 +1,245 @@
+"""What is wrong with a scene or a site, and the remedy for each."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.scene.materials import ITU_MATERIALS, complex_permittivity, itu_name
+from rayfix_offline.scene.scene import METRES_PER_UNIT, Scene
+from rayfix_offline.site import SiteFile, StationSection
+from rayfix_offline.twin.cleaning import Repeats
+from rayfix_offline.twin.enclosures import Enclosures
+from rayfix_offline.twin.solids import Part, touched
+
+LARGE_SCENE, SMALL_SCENE = 1000.0, 1.0
+"""A scene larger or smaller than this has probably another unit, m."""
+
+FAR = 10_000.0
+"""Farther from the origin than this, m, rays meet triangles, in single precision, by more than a millimetre off."""
+
+MOST_NAMES = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Something about the site that its author should know.
+
+    Attributes
+    ----------
+    severity : {"error", "warning"}
+        An error stops the build.
+    kind : str
+        What it is about, in one or two words; the same for all findings of a kind.
+    problem : str
+        What is wrong, and where.
+    remedy : str
+        What to do about it.
+    station_id : str, optional
+        Of the station that it is about.
+    """
+
+    severity: Literal["error", "warning"]
+    kind: str
+    problem: str
+    remedy: str
+    station_id: str | None = None
+
+    @property
+    def message(self) -> str:
+        """Problem and remedy."""
+        return f"{self.problem}; {self.remedy}"
+
+
+def warning(kind: str, problem: str, remedy: str) -> Finding:
+    """Return a finding that does not stop the build."""
+    return Finding(severity="warning", kind=kind, problem=problem, remedy=remedy)
+
+
+def error(kind: str, problem: str, remedy: str, *, station_id: str | None = None) -> Finding:
+    """Return a finding that stops the build."""
+    return Finding(severity="error", kind=kind, problem=problem, remedy=remedy, station_id=station_id)
+
+
+def size_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
+    """Check unit, upward axis and place of the scene."""
+    extent = scene.bounds[1] - scene.bounds[0]
+    size = " x ".join(f"{length:,.6g}" for length in extent)
+    if extent.max() > LARGE_SCENE:
+        remedy = 'if its coordinates are millimetres, set scene_unit = "mm"'
+        yield warning("unit", f"the scene is {size} m large", remedy)
+    elif extent.max() < SMALL_SCENE:
+        yield warning("unit", f"the scene is only {size} m large", "set scene_unit to the unit of its coordinates")
+    if extent[2] > 2.0 * extent[:2].min() and not scene.says_up:
+        other = _other_axis(site)
+        yield warning(
+            "upward axis",
+            f"the scene is {size} m large and seems to lie on its side",
+            f'if {other} points up, set scene_up = "{other}"',
+        )
+    distance = float(np.abs(scene.bounds).max())
+    if distance > FAR:
+        yield warning(
+            "origin",
+            f"the scene lies {distance / 1000.0:,.0f} km from its origin, where rays miss triangles by millimetres",
+            "move scene and stations next to the origin",
+        )
+
+
+def mesh_findings(scene: Scene, repeats: Repeats, parts: Sequence[Part], enclosures: Enclosures) -> Iterator[Finding]:
+    """Find triangles and parts that a clean mesh does not have."""
+    if scene.num_degenerate:
+        problem = f"{scene.num_degenerate} triangles have no area and are left out"
+        yield warning("degenerate", problem, "clean the mesh")
+    if repeats.num_copies:
+        problem = f"{repeats.num_copies} triangles are there twice and are left out"
+        yield warning("duplicate", problem, "remove duplicate faces from the mesh")
+    if repeats.num_backs:
+        problem = f"{repeats.num_backs} triangles are the back sides of others and are left out"
+        yield warning("duplicate", problem, "export one side only: either side reflects")
+    if repeats.coinciding:
+        pairs = [f"{a} and {b}" for a, b in repeats.coinciding]
+        yield warning("duplicate", f"objects that coincide, wholly or in part: {_listed(pairs)}", "keep one of them")
+    sheets = [part for part in parts if not part.closed]
+    if sheets:
+        yield warning(
+            "open",
+            f"open parts without an inside: {_names(sheets)}; they reflect, but count as sheets and not as solids",
+            "close them if they are solid",
+        )
+    crowded = [part for part in parts if not part.manifold]
+    if crowded:
+        yield warning(
+            "non-manifold",
+            f"parts with edges that more than two triangles share: {_names(crowded)}",
+            "harmless where solids touch; else remove what is inside the mesh",
+        )
+    mixed = [part for part in parts if part.closed and part.manifold and not part.consistent]
+    if mixed:
+        problem = f"parts whose triangles face different ways: {_names(mixed)}"
+        yield warning("facing", problem, "harmless here, but mend the mesh")
+    inverted = [
+        part
+        for part, encloses in zip(parts, enclosures.enclosing, strict=True)
+        if part.closed and part.consistent and part.volume < 0 and not encloses
+    ]
+    if inverted:
+        problem = f"solids whose triangles face inwards: {_names(inverted)}"
+        yield warning("facing", problem, "harmless here, but mend the mesh")
+
+
+def material_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
+    """Find where the constant loss stands in for a material."""
+    if site.propagation.reflection != "itu":
+        return
+    bare = np.count_nonzero(scene.face_materials < 0)
+    if bare:
+        yield warning(
+            "material",
+            f"{bare} of {len(scene.faces)} triangles have no material: reflection_loss_db is taken",
+            "give them one of ITU-R P.2040, e.g. itu_concrete",
+        )
+    carrier = site.propagation.carrier_ghz
+    unknown = []
+    for n, name in enumerate(scene.materials):
+        if complex_permittivity(name, carrier) is not None or not np.any(scene.face_materials == n):
+            continue
+        known = itu_name(name)
+        if known is None:
+            unknown.append(f"'{name}'")
+            continue
+        ranges = " and ".join(f"{row.lowest_ghz:g} to {row.highest_ghz:g} GHz" for row in ITU_MATERIALS[known])
+        yield warning(
+            "material",
+            f"material '{name}' is known for {ranges} only, not at carrier_ghz = {carrier:g}: reflection_loss_db is "
+            "taken",
+            "choose another material",
+        )
+    if unknown:
+        yield warning(
+            "material",
+            f"material{'s' if len(unknown) > 1 else ''} {_listed(unknown)} unknown: reflection_loss_db is taken",
+            f"ITU-R P.2040 has {', '.join(ITU_MATERIALS)}",
+        )
+
+
+def station_findings(site: SiteFile, scene: Scene, parts: Sequence[Part], enclosures: Enclosures) -> Iterator[Finding]:
+    """Find stations where none can be."""
+    outside = _what_would_hold_stations(site, scene) or "correct position_m or scene_unit"
+    for s, station in enumerate(site.stations):
+        position = np.array(station.position_m)
+        place = _placed(station)
+        problem = _misplacement(position, scene, parts, enclosures, s)
+        if problem is not None:
+            where, remedy = problem
+            yield error("station", f"{place} lies {where}", remedy or outside, station_id=station.id)
+
+
+def _misplacement(
+    position: NDArray[np.float64], scene: Scene, parts: Sequence[Part], enclosures: Enclosures, station: int
+) -> tuple[str, str] | None:
+    """Where a station is that cannot be there, and the remedy, empty where it is far off; None where all is well."""
+    low, high = scene.bounds
+    if np.any(position < low) or np.any(position > high):
+        box = " to ".join(f"({', '.join(f'{v:g}' for v in corner)})" for corner in (low, high))
+        return f"outside the scene, which spans {box} m", ""
+    face = touched(scene.triangles, position)
+    if face >= 0:
+        return f"on the surface of '{scene.objects[scene.face_objects[face]]}'", "move it a few centimetres off"
+    held = [int(p) for p in np.flatnonzero(enclosures.inside[:, station]) if not enclosures.enclosing[p]]
+    if held:
+        return f"inside the solid '{parts[held[0]].name}'", "move it into free space"
+    if enclosures.rooms.any() and not enclosures.inside[enclosures.rooms, station].any():
+        rooms = [f"'{part.name}'" for part, is_room in zip(parts, enclosures.rooms, strict=True) if is_room]
+        return f"outside or in the wall of {_listed(rooms)}", "move it into free space"
+    return None
+
+
+def _what_would_hold_stations(site: SiteFile, scene: Scene) -> str | None:
+    """Return the unit or the upward axis with which all stations would lie inside; None when they do, or none does."""
+    positions = np.array([station.position_m for station in site.stations])
+
+    def held(bounds: NDArray[np.float64]) -> bool:
+        return bool(np.all((positions >= bounds[0]) & (positions <= bounds[1])))
+
+    remedy = None
+    if not held(scene.bounds):
+        current = METRES_PER_UNIT[site.site.scene_unit]
+        units = [unit for unit, metres in METRES_PER_UNIT.items() if held(scene.bounds * metres / current)]
+        if units:
+            remedy = f'scene_unit = "{units[0]}"'
+        elif not scene.says_up and held(_turned(scene.bounds, site.site.scene_up)):
+            remedy = f'scene_up = "{_other_axis(site)}"'
+    return remedy and f"set {remedy}: then all stations lie inside"
+
+
+def _other_axis(site: SiteFile) -> str:
+    return "z" if site.site.scene_up == "y" else "y"
+
+
+def _turned(bounds: NDArray[np.float64], up: str) -> NDArray[np.float64]:
+    """Bounds of a scene that was read with this axis up, as if it were the other one."""
+    x, y, z = bounds.T
+    turned = (x, z, -y) if up == "y" else (x, -z, y)
+    return np.sort(np.stack(turned, axis=1), axis=0)
+
+
+def _placed(station: StationSection) -> str:
+    return f"station '{station.id}' at ({', '.join(f'{v:g}' for v in station.position_m)}) m"
+
+
+def _names(parts: Sequence[Part]) -> str:
+    """Name parts; a number alone would not help to find them."""
+    return _listed(
+        [
+            f"{part.name} at ({', '.join(f'{v:.1f}' for v in part.middle)})" if "#" in part.name else part.name
+            for part in parts
+        ]
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return ", ".join(names[:MOST_NAMES]) + more

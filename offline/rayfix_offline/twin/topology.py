@@ -1,0 +1,134 @@
+"""How the triangles of a scene hang together: which corners are one point and which sides one edge."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from rayfix_offline.scene.scene import Scene
+
+WELD = 1e-6
+"""Vertices whose coordinates round to the same multiple of this are one point, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Topology:
+    """Points and edges of a scene's triangles.
+
+    Attributes
+    ----------
+    points : ndarray of int64, shape (n_faces, 3)
+        Point at each corner of each triangle.
+    edges : ndarray of int64, shape (n_faces, 3)
+        Edge of each side of each triangle; side k runs from corner k to the next.
+    """
+
+    points: NDArray[np.int64]
+    edges: NDArray[np.int64]
+
+    def neighbours(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Sides that two triangles, and no third, have in common.
+
+        Returns
+        -------
+        first, second : ndarray of int64, shape (n_pairs,)
+            Sides of the one and of the other triangle: triangle k // 3, its side k % 3.
+        """
+        sides = self.edges.reshape(-1)
+        order = np.argsort(sides, kind="stable")
+        paired = order[np.bincount(sides)[sides[order]] == 2]
+        return paired[0::2], paired[1::2]
+
+    def components(self, groups: NDArray[np.integer], *, among: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """Label the connected parts of triangles; they hang together at points, within their group.
+
+        Parameters
+        ----------
+        groups : ndarray of int, shape (n_faces,)
+        among : ndarray of int, optional
+            Triangles to look at; all when left out.
+
+        Returns
+        -------
+        ndarray of int64, shape (n_faces,) or (len(among),)
+        """
+        points = self.points if among is None else self.points[among]
+        group = groups if among is None else groups[among]
+        if not len(points):
+            return np.zeros(0, np.int64)
+        keys = points * (int(group.max()) + 1) + np.asarray(group, np.int64)[:, None]
+        nodes, at = np.unique(keys, return_inverse=True)
+        at = at.reshape(points.shape)
+        label = connect(np.concatenate([at[:, [0, 1]], at[:, [1, 2]]]), len(nodes))
+        return np.asarray(label[at[:, 0]])
+
+    def uses_within(self, groups: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Count how triangles of a group use the edges.
+
+        Parameters
+        ----------
+        groups : ndarray of int, shape (n_faces,)
+
+        Returns
+        -------
+        uses : ndarray of int64, shape (n_faces, 3)
+            Triangles of the same group that have the side's edge, the triangle itself included.
+        balance : ndarray of int64, shape (n_faces, 3)
+            How many more of them run through the edge one way than the other; 0 where they face the same way.
+        """
+        keys = self.edges * (int(groups.max()) + 1) + np.asarray(groups, np.int64)[:, None]
+        _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+        inverse = inverse.reshape(-1)
+        forward = self.points < np.roll(self.points, -1, axis=1)
+        balance = np.bincount(inverse, weights=np.where(forward.reshape(-1), 1.0, -1.0)).astype(np.int64)
+        return counts[inverse].reshape(keys.shape), np.abs(balance)[inverse].reshape(keys.shape)
+
+
+def connect(links: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Label the connected components of a graph.
+
+    Parameters
+    ----------
+    links : ndarray of int, shape (n_links, 2)
+        Pairs of nodes.
+    count : int
+        Number of nodes.
+
+    Returns
+    -------
+    ndarray of int64, shape (count,)
+    """
+    graph = coo_array((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
+def number_rows(rows: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Give rows numbers in lexicographic order, equal ones the same, as ``np.unique`` does with ``axis=0``.
+
+    It goes column by column, for sorting numbers takes a fraction of the time of sorting rows.
+
+    Parameters
+    ----------
+    rows : ndarray of shape (n, d)
+
+    Returns
+    -------
+    ndarray of int64, shape (n,)
+    """
+    number = np.zeros(len(rows), np.int64)
+    for column in rows.T:
+        _, place = np.unique(column, return_inverse=True)
+        _, number = np.unique(number * (int(place.max(initial=0)) + 1) + place.reshape(-1), return_inverse=True)
+        number = number.reshape(-1)
+    return number
+
+
+def find_topology(scene: Scene) -> Topology:
+    """Weld the corners of a scene's triangles and find their edges."""
+    points = number_rows(np.round(scene.vertices / WELD))[scene.faces]
+    ends = np.roll(points, -1, axis=1)
+    keys = np.minimum(points, ends) * (int(points.max()) + 1) + np.maximum(points, ends)
+    edges = np.unique(keys, return_inverse=True)[1].reshape(points.shape)
+    return Topology(points=points, edges=edges)

@@ -1,0 +1,109 @@
+"""The digital twin, ready for rays: scene, mirror planes, ray engine and free space, checked against the site."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rayfix_offline.scene.engine import EmbreeEngine, RayEngine
+from rayfix_offline.scene.scene import Scene, load_scene
+from rayfix_offline.site import SiteFile
+from rayfix_offline.twin.cleaning import find_repeats, without
+from rayfix_offline.twin.enclosures import find_enclosures
+from rayfix_offline.twin.findings import (
+    Finding,
+    error,
+    material_findings,
+    mesh_findings,
+    size_findings,
+    station_findings,
+)
+from rayfix_offline.twin.planes import Planes, merge_coplanar
+from rayfix_offline.twin.solids import map_free_space, sealed_space, split_parts
+from rayfix_offline.twin.surfaces import join_facets
+from rayfix_offline.twin.topology import find_topology
+from rayfix_tables.errors import SceneError
+from rayfix_tables.freespace import FreeSpace
+
+VOXEL_SIZE = 0.1
+"""Edge of a voxel of the free space, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Twin:
+    """A scene that rays can be launched in."""
+
+    scene: Scene
+    planes: Planes
+    engine: RayEngine
+    free_space: FreeSpace
+    closed: bool
+    findings: tuple[Finding, ...]
+
+
+def prepare_twin(site: SiteFile, folder: Path) -> Twin:
+    """Load and check the scene of a site.
+
+    Parameters
+    ----------
+    folder : Path
+        The site file's; the scene's path is relative to it.
+
+    Raises
+    ------
+    SceneError
+        When the scene cannot be read. What is wrong with a readable scene is in the twin's findings.
+    """
+    return prepare_scene(site, load_scene(folder / site.site.scene, unit=site.site.scene_unit, up=site.site.scene_up))
+
+
+def prepare_scene(site: SiteFile, scene: Scene) -> Twin:
+    """Check a scene that is loaded already; see :func:`prepare_twin`."""
+    topology = find_topology(scene)
+    repeats = find_repeats(scene, topology)
+    if repeats.needless.any():
+        scene = without(scene, repeats.needless)
+        topology = find_topology(scene)
+    parts = split_parts(scene, topology)
+    stations = np.array([station.position_m for station in site.stations])
+    enclosures = find_enclosures(scene, parts, stations)
+    free_space = map_free_space(
+        scene,
+        solids=[part for part, shell in zip(parts, enclosures.enclosing, strict=True) if part.closed and not shell],
+        rooms=[part for part, is_room in zip(parts, enclosures.rooms, strict=True) if is_room],
+        voxel_size=VOXEL_SIZE,
+    )
+    closed = bool(enclosures.rooms.any())
+    if not closed:
+        sealed = sealed_space(free_space, stations)
+        closed, free_space = sealed is not None, sealed or free_space
+    findings = [
+        *size_findings(site, scene),
+        *mesh_findings(scene, repeats, parts, enclosures),
+        *material_findings(site, scene),
+        *station_findings(site, scene, parts, enclosures),
+    ]
+    if not free_space.free.any():
+        problem = "the scene has no free space: every voxel lies in a solid or outside"
+        findings.append(error("free space", problem, "check for an inverted room"))
+    return Twin(
+        scene=scene,
+        planes=join_facets(scene.triangles, merge_coplanar(scene.triangles), topology),
+        engine=EmbreeEngine(scene.triangles),
+        free_space=free_space,
+        closed=closed,
+        findings=tuple(findings),
+    )
+
+
+def refuse_errors(twin: Twin) -> None:
+    """Raise what stops a build, all of it at once.
+
+    Raises
+    ------
+    SceneError
+        When the twin has findings that are errors.
+    """
+    errors = [finding.message for finding in twin.findings if finding.severity == "error"]
+    if errors:
+        raise SceneError("; ".join(errors))

@@ -1,0 +1,1 @@
+"""Cells of the table that answer an angle."""

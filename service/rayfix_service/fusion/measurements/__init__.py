@@ -1,0 +1,1 @@
+"""What a report says: measurements, their error models, clocks and directions."""

@@ -1,0 +1,1 @@
+"""The posterior of the position: modes, candidates, outliers, regions and the fix."""

@@ -1,0 +1,95 @@
+"""What comes out of a fix, in SI units.
+
+The JSON of the HTTP interface is another matter: :mod:`rayfix_service.wire` writes it.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.measurements.report import CONFIDENCE
+
+if TYPE_CHECKING:
+    from rayfix_service.fusion.posterior.credible import CredibleRegions
+
+
+Status = Literal["ok", "ambiguous", "inconsistent", "insufficient"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """One place where the UE may be.
+
+    Attributes
+    ----------
+    probability : float
+        Posterior probability that the UE is there.
+    position : ndarray of shape (3,), m
+        Mean of the posterior over one of its hills.
+    covariance : ndarray of shape (3, 3), m2
+        Second moment of the posterior about ``position``.
+    """
+
+    probability: float
+    position: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of one measurement of the report.
+
+    Attributes
+    ----------
+    used : bool
+        False for a measurement that could not contribute; ``reason`` then says why.
+    outlier_probability : float or None
+        Posterior probability that this measurement has nothing to do with the position; None when not used.
+    """
+
+    used: bool
+    outlier_probability: float | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fix:
+    """The answer to a report.
+
+    Attributes
+    ----------
+    status : {"ok", "ambiguous", "inconsistent", "insufficient"}
+        Whether the position can be trusted; docs/how-it-works.md defines each.
+    candidates : tuple of Candidate
+        Most probable first; empty when no measurement could be used or all contradict the table.
+    outcomes : tuple of Outcome
+        One per measurement of the report, in its order.
+    log_evidence : float
+        Natural logarithm of the probability density of the report, for comparing reports.
+    regions : CredibleRegions or None
+        Regions around the position that hold the UE with any probability; None where there is no position.
+    confidence : float
+        Probability that the report wants regions of.
+    """
+
+    status: Status
+    candidates: tuple[Candidate, ...]
+    outcomes: tuple[Outcome, ...]
+    log_evidence: float
+    table_id: str
+    regions: "CredibleRegions | None" = None
+    confidence: float = CONFIDENCE
+    target_id: str | None = None
+    timestamp: str | None = None
+
+    @property
+    def position(self) -> NDArray[np.float64] | None:
+        """Position of the most probable candidate, shape (3,), m."""
+        return self.candidates[0].position if self.candidates else None
+
+    @property
+    def covariance(self) -> NDArray[np.float64] | None:
+        """Covariance of the most probable candidate, shape (3, 3), m2."""
+        return self.candidates[0].covariance if self.candidates else None

@@ -1,0 +1,109 @@
+"""Sum the hypotheses of a report up in a fix."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rayfix_service.fusion.measurements.observations import Observation
+from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.posterior.credible import CredibleRegions
+from rayfix_service.fusion.posterior.fix import Candidate, Fix, Outcome, Status
+from rayfix_service.fusion.posterior.summary import sum_up
+from rayfix_service.fusion.product.beam import Hypotheses
+from rayfix_service.fusion.product.outliers import culprits
+from rayfix_service.fusion.product.prior import Prior
+from rayfix_service.fusion.settings import FusionSettings
+from rayfix_tables.table import Table
+
+_LEAST_CANDIDATE = 1e-3
+"""Candidates less probable than this are not told."""
+
+
+class Product(NamedTuple):
+    """Hypotheses of a report, None where nothing could be used, and what they were made of.
+
+    Attributes
+    ----------
+    observations : list of Observation
+        Those that contribute.
+    unused : dict of int to str
+        Why measurements do not, by their places in the report.
+    prior : Prior
+    hypotheses : Hypotheses or None
+    """
+
+    observations: list[Observation]
+    unused: dict[int, str]
+    prior: Prior
+    hypotheses: Hypotheses | None
+
+
+def make_fix(report: Report, product: Product, table: Table, settings: FusionSettings) -> Fix:
+    """Sum the hypotheses of a report up.
+
+    Parameters
+    ----------
+    report : Report
+    product : Product
+        Of the report.
+    table : Table
+        Of the same site; its free space is what the hypotheses are cut to.
+    settings : FusionSettings
+    """
+    candidates: tuple[Candidate, ...] = ()
+    regions = None
+    log_evidence, outlier = 0.0, dict[int, float]()
+    status: Status = "insufficient"
+    hypotheses = product.hypotheses
+    if hypotheses is not None:
+        found = culprits(product.observations)
+        if not len(hypotheses):
+            log_evidence, status = hypotheses.log_lost, "inconsistent"
+            outlier = dict.fromkeys(found.places, 1.0)
+        else:
+            summary = sum_up(hypotheses, found, table.scene.free_space, settings.hypothesis_floor)
+            log_evidence, share = summary.log_evidence, 1.0 - summary.lost
+            candidates = tuple(
+                Candidate(probability=p * share, position=summary.position[n], covariance=summary.moment[n])
+                for n, p in enumerate(summary.probability.tolist())
+                if p > _LEAST_CANDIDATE or n == 0
+            )
+            outlier = dict(zip(found.places, summary.outlier.tolist(), strict=True))
+            status = _status(candidates, summary.half_bad, settings)
+            best = candidates[0]
+            regions = CredibleRegions(
+                position=best.position, covariance=best.covariance, points=summary.points, share=share
+            )
+    unused = product.unused
+    outcomes = tuple(
+        [
+            Outcome(used=False, reason=unused[n])
+            if n in unused
+            else Outcome(used=True, outlier_probability=outlier.get(n))
+            for n in range(len(report.measurements))
+        ]
+    )
+    return Fix(
+        status=status,
+        candidates=candidates,
+        outcomes=outcomes,
+        log_evidence=log_evidence,
+        regions=regions,
+        confidence=report.confidence,
+        table_id=table.table_id,
+        target_id=report.target_id,
+        timestamp=report.timestamp,
+    )
+
+
+def _status(candidates: tuple[Candidate, ...], half_bad: float, settings: FusionSettings) -> Status:
+    """Status of a fix, given the probability that at least half of the factors are outliers."""
+    if half_bad > 0.5:
+        return "inconsistent"
+    if candidates[0].probability < settings.ambiguous_below:
+        rivals = sum(candidate.probability for candidate in candidates[: settings.most_rivals])
+        return "ambiguous" if rivals >= settings.ambiguous_below else "insufficient"
+    # The sum of all variances is at least the largest, and three times it at most.
+    most, cov = settings.insufficient_above**2, candidates[0].covariance
+    narrow = float(cov.trace()) <= most or float(np.linalg.eigvalsh(cov)[-1]) <= most
+    return "ok" if narrow else "insufficient"

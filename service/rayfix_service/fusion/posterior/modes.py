@@ -1,0 +1,209 @@
+"""From a mixture of hypotheses to candidates: the hills of the posterior, and which hypotheses belong to which.
+
+The NumPy twins of some kernels are in ``reference.py``.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from rayfix_service.fusion.posterior.cholesky import cholesky, invert, solve
+from rayfix_service.fusion.posterior.voxels import is_free_place, nearest_free
+
+_SAME_HILL = 9.0
+"""Two modes nearer than this, squared and in what either is uncertain by, are two humps of one hill."""
+
+_NEAR = 3.0
+"""A position in a solid moves to free space within this many standard deviations."""
+
+
+@numba.njit(cache=True, nogil=True)
+def find_hills(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any) -> Any:
+    """Climb from Gaussians to the modes of their mixture, gather them by the hill they belong to, sum each hill up.
+
+    Parameters
+    ----------
+    log_weight : ndarray of shape (h,)
+        Natural logarithms; the weights sum to 1.
+    mean : ndarray of shape (h, 3), m
+    cov : ndarray of shape (h, 3, 3), m2
+    origin, voxel_size, free
+        As in :class:`~rayfix_tables.freespace.FreeSpace`.
+
+    Returns
+    -------
+    probability : ndarray of shape (m,)
+        Of each hill, the most probable first.
+    position : ndarray of shape (m, 3), m
+        Mean of the hill's Gaussians; the hill's mode, or the nearest free place, where the mean is in a solid.
+    moment : ndarray of shape (m, 3, 3), m2
+        Second moment of the hill's Gaussians about ``position``.
+    member : ndarray of int64, shape (h,)
+        Hill of each Gaussian.
+    """
+    count = len(log_weight)
+    log_density = np.empty(count)
+    precision, lower = np.empty((count, 3, 3)), np.empty((3, 3))
+    for h in range(count):
+        cholesky(cov[h], lower)
+        invert(lower, precision[h])
+        log_density[h] = log_weight[h] - np.log(lower[0, 0] * lower[1, 1] * lower[2, 2])
+    top, member = gather(log_density, mean, precision, _SAME_HILL)
+    weight = np.exp(log_weight)
+    probability, position = np.zeros(len(top)), np.zeros((len(top), 3))
+    for h in range(count):
+        probability[member[h]] += weight[h]
+        for i in range(3):
+            position[member[h], i] += weight[h] * mean[h, i]
+    for n in range(len(top)):
+        position[n] /= probability[n]
+        if not is_free_place(free, origin, voxel_size, position[n]):
+            position[n] = top[n]
+    moment = _second_moments(weight, mean, cov, member, probability, position)
+    moved = False
+    for n in range(len(top)):
+        if not is_free_place(free, origin, voxel_size, position[n]):
+            moved |= nearest_free(position[n], moment[n], _NEAR, origin, voxel_size, free)
+    if moved:
+        moment = _second_moments(weight, mean, cov, member, probability, position)
+    order = np.argsort(-probability, kind="mergesort")
+    rank = np.empty(len(top), np.int64)
+    rank[order] = np.arange(len(top))
+    # A sum of rounded numbers may be a little more than 1.
+    return np.minimum(probability[order], 1.0), position[order], moment[order], rank[member]
+
+
+@numba.njit(cache=True, nogil=True)
+def _second_moments(weight: Any, mean: Any, cov: Any, member: Any, total: Any, position: Any) -> Any:
+    """Second moment of each hill, shape (m, 3, 3), about its position."""
+    moment = np.zeros((len(total), 3, 3))
+    for h in range(len(weight)):
+        n = member[h]
+        share = weight[h] / total[n]
+        for i in range(3):
+            for j in range(3):
+                apart = (mean[h, i] - position[n, i]) * (mean[h, j] - position[n, j])
+                moment[n, i, j] += share * (cov[h, i, j] + apart)
+    return moment
+
+
+@numba.njit(cache=True, nogil=True)
+def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any) -> Any:
+    """Climb from each hypothesis, the densest first, and gather the hypotheses by the hill they come to.
+
+    Parameters
+    ----------
+    log_density : ndarray of shape (h,)
+        Log weight plus half the log determinant of the precision.
+    mean : ndarray of shape (h, 3), m
+    precision : ndarray of shape (h, 3, 3), 1 / m2
+    same_hill : float
+        Two modes are one hill, though with two humps, when their squared distance is below this in what either is
+        uncertain by.
+
+    Returns
+    -------
+    top : ndarray of shape (m, 3), m
+        Mode of each hill, in the order in which they were found.
+    member : ndarray of int64, shape (h,)
+        Hill of each hypothesis.
+    """
+    count = len(log_density)
+    member = np.empty(count, np.int64)
+    top = np.empty((count, 3))
+    curvature = np.empty((count, 3, 3))
+    found = 0
+    for h in np.argsort(-log_density):
+        mode, here, hill = climb(log_density, mean, precision, mean[h], top[:found], curvature[:found])
+        for n in range(found):
+            if hill >= 0:
+                break
+            if min(_square(mode, top[n], curvature[n]), _square(mode, top[n], here)) < same_hill:
+                hill = n
+        if hill < 0:
+            hill = found
+            top[found] = mode
+            curvature[found] = here
+            found += 1
+        member[h] = hill
+    return top[:found].copy(), member
+
+
+@numba.njit(cache=True, nogil=True)
+def _square(x: Any, y: Any, precision: Any) -> Any:
+    """Square of the Mahalanobis distance."""
+    a, b, c = x[0] - y[0], x[1] - y[1], x[2] - y[2]
+    straight = a * a * precision[0, 0] + b * b * precision[1, 1] + c * c * precision[2, 2]
+    return straight + 2.0 * (a * b * precision[1, 0] + a * c * precision[2, 0] + b * c * precision[2, 1])
+
+
+@numba.njit(cache=True, nogil=True)
+def climb(log_density: Any, mean: Any, precision: Any, start: Any, top: Any, curvature: Any) -> Any:
+    """Climb to a mode of a Gaussian mixture by the fixed point of its stationarity condition.
+
+    M. A. Carreira-Perpinan, "Mode-finding for mixtures of Gaussian distributions", IEEE Trans. PAMI 22 (11), 2000:
+    at a mode ``x = (sum r_h P_h)^-1 sum r_h P_h m_h`` with the responsibilities r_h at x.
+
+    Parameters
+    ----------
+    log_density, mean, precision : ndarray
+        As in :func:`gather`.
+    start : ndarray of shape (3,), m
+    top : ndarray of shape (m, 3), m
+        Modes found already, the climb to which may be cut short.
+    curvature : ndarray of shape (m, 3, 3), 1 / m2
+        Mean precision of the hypotheses there.
+
+    Returns
+    -------
+    mode : ndarray of shape (3,), m
+    curvature : ndarray of shape (3, 3), 1 / m2
+    found : int
+        Which of the modes found already attracts here, -1 for none.
+    """
+    count = len(log_density)
+    x, step = start.copy(), np.empty(3)
+    logs = np.empty(count)
+    matrix = np.empty((3, 3))
+    vector = np.empty(3)
+    lower = np.empty((3, 3))
+    for _ in range(500):
+        for n in range(len(top)):
+            # A hundredth: within a tenth of its deviation nothing but the mode itself attracts.
+            if _square(x, top[n], curvature[n]) < 0.01:
+                return x, matrix, n
+        highest = -np.inf
+        for h in range(count):
+            logs[h] = log_density[h] - 0.5 * _square(x, mean[h], precision[h])
+            highest = max(highest, logs[h])
+        total = 0.0
+        xx, yx, yy, zx, zy, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        px, py, pz = 0.0, 0.0, 0.0
+        for h in range(count):
+            if logs[h] < highest - 28.0:
+                continue
+            share = np.exp(logs[h] - highest)
+            total += share
+            a, b, c = mean[h, 0] - x[0], mean[h, 1] - x[1], mean[h, 2] - x[2]
+            own = precision[h]
+            xx += share * own[0, 0]
+            yx += share * own[1, 0]
+            yy += share * own[1, 1]
+            zx += share * own[2, 0]
+            zy += share * own[2, 1]
+            zz += share * own[2, 2]
+            px += share * (own[0, 0] * a + own[1, 0] * b + own[2, 0] * c)
+            py += share * (own[1, 0] * a + own[1, 1] * b + own[2, 1] * c)
+            pz += share * (own[2, 0] * a + own[2, 1] * b + own[2, 2] * c)
+        matrix[0, 0], matrix[1, 1], matrix[2, 2] = xx, yy, zz
+        matrix[0, 1], matrix[0, 2], matrix[1, 2] = yx, zx, zy
+        matrix[1, 0], matrix[2, 0], matrix[2, 1] = yx, zx, zy
+        vector[0], vector[1], vector[2] = px, py, pz
+        cholesky(matrix, lower)
+        solve(lower, vector, step)
+        x += step
+        matrix /= total
+        if max(abs(step[0]), abs(step[1]), abs(step[2])) < 1e-6:
+            break
+    return x, matrix, -1

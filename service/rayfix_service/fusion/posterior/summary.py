@@ -1,0 +1,113 @@
+"""Sum the hypotheses of a report up, in one compiled kernel: there are few of them, but much is asked of each."""
+
+import math
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.posterior.cholesky import log_sum
+from rayfix_service.fusion.posterior.cut_by_walls import cut_to_free_space
+from rayfix_service.fusion.posterior.modes import find_hills
+from rayfix_service.fusion.posterior.points import DrawnPoints, draw_points
+from rayfix_service.fusion.product.beam import Hypotheses
+from rayfix_service.fusion.product.outliers import Culprits, outlier_probabilities
+from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.gaussians.normal_points import normal_points, unit_points
+
+_NUM_POINTS = 1024
+"""Points that stand for the posterior in credible regions."""
+
+
+class Summary(NamedTuple):
+    """What the hypotheses of a report come to.
+
+    Attributes
+    ----------
+    log_evidence : float
+        Natural logarithm of the probability density of the report.
+    lost : float
+        Posterior probability that all of it is outliers.
+    probability : ndarray of shape (m,)
+        Of the posterior's hills, the most probable first, were not all of it outliers.
+    position : ndarray of shape (m, 3), m
+    moment : ndarray of shape (m, 3, 3), m2
+        Second moment of each hill about its position.
+    outlier : ndarray of shape (count,)
+        Posterior probability of each of the culprits' measurements to be an outlier.
+    half_bad : float
+        Posterior probability that at least half of the observations are outliers altogether.
+    points : DrawnPoints
+    """
+
+    log_evidence: float
+    lost: float
+    probability: NDArray[np.float64]
+    position: NDArray[np.float64]
+    moment: NDArray[np.float64]
+    outlier: NDArray[np.float64]
+    half_bad: float
+    points: DrawnPoints
+
+
+def sum_up(hypotheses: Hypotheses, culprits: Culprits, free_space: FreeSpace, floor: float) -> Summary:
+    """Sum hypotheses up, cut to the free space.
+
+    Parameters
+    ----------
+    hypotheses : Hypotheses
+        At least one.
+    floor : float
+        Hypotheses whose share of the posterior is below this are left out of the hills.
+    """
+    log_evidence, lost, hills, outlier, half_bad, drawn = _sum_up(
+        hypotheses.log_weight,
+        hypotheses.mean,
+        hypotheses.cov,
+        hypotheses.outlier,
+        hypotheses.log_lost,
+        culprits.rows,
+        len(culprits.places),
+        math.log(floor),
+        unit_points(),
+        normal_points(_NUM_POINTS),
+        free_space.origin,
+        free_space.voxel_size,
+        free_space.free,
+    )
+    probability, position, moment = hills
+    mean, root, owner = drawn
+    points = DrawnPoints(mean=mean, root=root, owner=owner)
+    return Summary(log_evidence, lost, probability, position, moment, outlier, half_bad, points)
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_up(
+    log_weight: Any,
+    mean: Any,
+    cov: Any,
+    outlier: Any,
+    log_lost: Any,
+    rows: Any,
+    count: Any,
+    log_floor: Any,
+    unit: Any,
+    normal: Any,
+    origin: Any,
+    voxel_size: Any,
+    free: Any,
+) -> Any:
+    """Give the entries of a :class:`Summary`; ``unit`` and ``normal`` are points that stand for a standard normal."""
+    log_cut, cut_mean, cut_cov = cut_to_free_space(log_weight, mean, cov, unit, origin, voxel_size, free)
+    log_found = log_sum(log_cut)
+    log_evidence = np.logaddexp(log_found, log_lost)
+    lost = np.exp(log_lost - log_evidence)
+    log_cut -= log_found
+    keep = np.flatnonzero(log_cut > log_floor)
+    kept = log_cut[keep], cut_mean[keep], cut_cov[keep]
+    probability, position, moment, _ = find_hills(*kept, origin, voxel_size, free)
+    weight = (1.0 - lost) * np.exp(log_cut)
+    totals, half_bad = outlier_probabilities(outlier, weight, lost, rows, count)
+    drawn = draw_points(log_weight, mean, cov, normal, origin, voxel_size, free)
+    return log_evidence, lost, (probability, position, moment), totals, half_bad, drawn

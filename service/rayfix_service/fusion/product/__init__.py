@@ -1,0 +1,1 @@
+"""Factors of the stations and their product, the hypotheses."""

@@ -1,0 +1,80 @@
+"""Multiply factors: hypotheses that pick one alternative of each, the best of them kept and the like merged."""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.product.beam_kernels import multiply_factors
+from rayfix_service.fusion.product.factors import Factor
+from rayfix_service.fusion.product.prior import Prior
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hypotheses:
+    """Products of factors, each a Gaussian over the position.
+
+    Attributes
+    ----------
+    log_weight : ndarray of shape (h,)
+        Log evidence, the best first.
+    mean : ndarray of shape (h, 3), m
+    cov : ndarray of shape (h, 3, 3), m2
+    outlier : ndarray of int8, shape (h, n_factors)
+        What the hypothesis takes for an outlier in each factor.
+    log_lost : float
+        Log evidence of the hypothesis that all factors are outliers, which is none of the above.
+    """
+
+    log_weight: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    cov: NDArray[np.float64]
+    outlier: NDArray[np.int8]
+    log_lost: float
+
+    def __len__(self) -> int:
+        """Return the number of hypotheses."""
+        return len(self.log_weight)
+
+
+def multiply(
+    factors: Sequence[Factor],
+    *,
+    max_path_length: float,
+    prior: Prior,
+    width: int,
+    max_divergence: float,
+) -> Hypotheses:
+    """Find the most probable products of one alternative of each factor.
+
+    Parameters
+    ----------
+    factors : sequence of Factor
+        At least one.
+    max_path_length : float, m
+        What the prior density of a clock's offset is the inverse of, wherever the offset is.
+    prior : Prior
+        Of the position.
+    width : int
+        Products that are kept after each factor, before those that mean the same are merged.
+    max_divergence : float
+        What such a merge may cost, nats.
+    """
+    columns = np.concatenate([factor.columns for factor in factors], axis=1)
+    outlier = np.concatenate([factor.outlier for factor in factors])
+    offsets = np.array([0, *itertools.accumulate([len(factor) for factor in factors])])
+    log_weight, mean, cov, outlier, log_lost = multiply_factors(
+        columns,
+        outlier,
+        offsets,
+        prior.precision,
+        prior.eta,
+        prior.log_volume,
+        math.log(max_path_length),
+        width,
+        max_divergence,
+    )
+    return Hypotheses(log_weight=log_weight, mean=mean, cov=cov, outlier=outlier, log_lost=log_lost)

@@ -1,0 +1,219 @@
+"""The compiled loop of the beam, on columns in information form.
+
+:mod:`rayfix_service.fusion.product.beam` calls it; :mod:`rayfix_service.fusion.product.information_form` defines the
+columns.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from rayfix_service.fusion.product.information_form import add, dimension_of, invert_all, log_integrals, triangle
+from rayfix_service.fusion.product.merging import merge_hypotheses
+
+HOPELESS = 20.0
+"""A product this many nats below the best is given up: more than one station to come would have to be an outlier."""
+
+
+@numba.njit(cache=True, nogil=True)
+def multiply_factors(
+    alternatives: Any,
+    outlier: Any,
+    offsets: Any,
+    precision: Any,
+    eta: Any,
+    log_volume: Any,
+    log_range: Any,
+    width: Any,
+    max_divergence: Any,
+) -> Any:
+    """Extend a beam by one factor after the other, merging hypotheses that mean the same.
+
+    Parameters
+    ----------
+    alternatives : ndarray of shape (rows, k)
+        Of all factors.
+    outlier : ndarray of int8, shape (k,)
+        What each takes for an outlier.
+    offsets : ndarray of int64, shape (n + 1,)
+        Alternatives of factor f are those from ``offsets[f]`` to ``offsets[f + 1]``.
+        The last of them is that all of it is an outlier.
+    precision, eta, log_volume : float
+        As in :class:`~rayfix_service.fusion.product.prior.Prior`.
+    log_range : float
+        As in :func:`~rayfix_service.fusion.product.information_form.log_integrals`.
+    width : int
+        Products that are kept after each factor.
+    max_divergence : float
+        What a merge may cost, nats.
+
+    Returns
+    -------
+    log_weight : ndarray of shape (h,)
+        Of the hypotheses that place the UE, the best first.
+    mean : ndarray of shape (h, 3), m
+    cov : ndarray of shape (h, 3, 3), m2
+    outlier : ndarray of int8, shape (h, n)
+    log_lost : float
+        Log evidence of the hypothesis that all factors are outliers, which is none of the above.
+    """
+    beam = _prior_column(dimension_of(alternatives), precision, eta, log_volume, log_range)
+    chosen = np.zeros((1, len(offsets) - 1), np.int8)
+    pattern = np.zeros(1, np.int64)
+    score = np.zeros(1)
+    for factor in _order(alternatives[-1], offsets):
+        begin, stop = offsets[factor], offsets[factor + 1]
+        own = np.ascontiguousarray(alternatives[:, begin:stop])
+        parent, choice, score = extend_beam(beam, own, width, HOPELESS, log_volume, log_range)
+        product = np.empty((len(beam), len(score)))
+        next_pattern = np.empty(len(score), np.int64)
+        for n in range(len(score)):
+            next_pattern[n] = 3 * pattern[parent[n]] + outlier[begin + choice[n]]
+        for row in range(len(beam)):
+            for n in range(len(score)):
+                product[row, n] = beam[row, parent[n]] + own[row, choice[n]]
+        left = merge_hypotheses(product, score, next_pattern, max_divergence)
+        left = left[np.argsort(-score[left], kind="mergesort")]
+        next_chosen = np.empty((len(left), chosen.shape[1]), np.int8)
+        for n in range(len(left)):
+            next_chosen[n] = chosen[parent[left[n]]]
+            next_chosen[n, factor] = outlier[begin + choice[left[n]]]
+        beam = np.empty((len(product), len(left)))
+        for row in range(len(product)):
+            for n in range(len(left)):
+                beam[row, n] = product[row, left[n]]
+        score, pattern, chosen = score[left], next_pattern[left], next_chosen
+    log_lost = 0.0
+    for factor in range(len(offsets) - 1):
+        log_lost += alternatives[-1, offsets[factor + 1] - 1]
+    log_weight, mean, cov, chosen = _placed(beam, score, chosen)
+    return log_weight, mean, cov, chosen, log_lost
+
+
+@numba.njit(cache=True, nogil=True)
+def _order(log_scale: Any, offsets: Any) -> Any:
+    """Order in which factors are taken, shape (n,): few alternatives first, which cut the beam before it meets many.
+
+    Which of two alike comes first must not depend on the report's order.
+    """
+    total = np.empty(len(offsets) - 1)
+    for factor in range(len(total)):
+        total[factor] = log_scale[offsets[factor] : offsets[factor + 1]].sum()
+    by_total = np.argsort(total, kind="mergesort")
+    return by_total[np.argsort(np.diff(offsets)[by_total], kind="mergesort")]
+
+
+@numba.njit(cache=True, nogil=True)
+def _prior_column(dimension: Any, precision: Any, eta: Any, log_volume: Any, log_range: Any) -> Any:
+    """Prior of position and clocks, shape (rows, 1); a clock lies evenly in a range of that logarithm."""
+    column = np.zeros((triangle(dimension) + dimension + 1, 1))
+    column[triangle(3) - 1] = precision
+    column[triangle(dimension) + 2] = eta
+    column[-1] = -(dimension - 3) * log_range - log_volume
+    return column
+
+
+@numba.njit(cache=True, nogil=True)
+def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: Any, log_range: Any) -> Any:
+    """Multiply every hypothesis by every alternative of a factor and keep the best products.
+
+    Parameters
+    ----------
+    beam : ndarray of shape (rows, h)
+        Hypotheses; the better come first for speed alone.
+    factor : ndarray of shape (rows, k)
+        Alternatives.
+    width : int
+        Products to keep.
+    hopeless : float
+        Products this many nats below the best are given up.
+    log_volume, log_range : float
+        As in :func:`~rayfix_service.fusion.product.information_form.log_integrals`.
+
+    Returns
+    -------
+    parent, choice : ndarray of int64, shape (n,)
+        Hypothesis and alternative of each product, in no order.
+    score : ndarray of shape (n,)
+        Log evidence of each product.
+    """
+    count = factor.shape[1]
+    products = np.empty(factor.shape)
+    values, scratch = np.empty(count), np.empty(count)
+    most = min(width, beam.shape[1] * count)
+    parent, choice = np.empty(most, np.int64), np.empty(most, np.int64)
+    score = np.empty(most)
+    heap = np.empty(most, np.int64)
+    kept = 0
+    top = -np.inf
+    for h in range(beam.shape[1]):
+        add(beam, h, factor, products)
+        log_integrals(products, log_volume, log_range, scratch, values)
+        for k in range(count):
+            value = values[k]
+            if not value >= top - hopeless:
+                continue
+            top = max(top, value)
+            if kept < most:
+                parent[kept], choice[kept], score[kept] = h, k, value
+                _sift_up(score, heap[: kept + 1])
+                kept += 1
+            elif value > score[heap[0]]:
+                slot = heap[0]
+                parent[slot], choice[slot], score[slot] = h, k, value
+                _sift_down(score, heap, kept)
+    hopeful = np.flatnonzero(score[:kept] >= top - hopeless)
+    return parent[hopeful], choice[hopeful], score[hopeful]
+
+
+@numba.njit(cache=True, nogil=True)
+def _sift_up(scores: Any, heap: Any) -> None:
+    """Take the last entry, which is new, into the heap whose least score is at ``heap[0]``."""
+    i = len(heap) - 1
+    heap[i] = i
+    while i > 0 and scores[heap[(i - 1) // 2]] > scores[heap[i]]:
+        up = (i - 1) // 2
+        heap[i], heap[up] = heap[up], heap[i]
+        i = up
+
+
+@numba.njit(cache=True, nogil=True)
+def _sift_down(scores: Any, heap: Any, count: Any) -> None:
+    """Restore the heap whose least score is at ``heap[0]``, after that entry has changed."""
+    i = 0
+    while True:
+        least = i
+        for child in (2 * i + 1, 2 * i + 2):
+            if child < count and scores[heap[child]] < scores[heap[least]]:
+                least = child
+        if least == i:
+            return
+        heap[i], heap[least] = heap[least], heap[i]
+        i = least
+
+
+@numba.njit(cache=True, nogil=True)
+def _placed(beam: Any, score: Any, chosen: Any) -> Any:
+    """Means and covariances of the position, of the hypotheses that say something of it."""
+    dimension = dimension_of(beam)
+    first = triangle(dimension)
+    cov = beam.copy()
+    for clock in range(3, dimension):
+        pivot = cov[triangle(clock) + clock]
+        for h in range(len(pivot)):
+            if pivot[h] <= 0.0:
+                # Of a clock that nothing constrains only this entry is not zero; it changes nothing else.
+                pivot[h] = 1.0
+    det = np.empty(len(score))
+    invert_all(cov, dimension, det)
+    placed = np.flatnonzero((beam[0] > 0.0) & (score > -np.inf) & (det > 0.0))
+    means, covs = np.zeros((len(placed), 3)), np.empty((len(placed), 3, 3))
+    for n in range(len(placed)):
+        h = placed[n]
+        for i in range(3):
+            for j in range(dimension):
+                means[n, i] += cov[triangle(max(i, j)) + min(i, j), h] * beam[first + j, h]
+            for j in range(3):
+                covs[n, i, j] = cov[triangle(max(i, j)) + min(i, j), h]
+    return score[placed], means, covs, chosen[placed]

@@ -1,0 +1,170 @@
+"""Turn an observation into a factor: alternatives for what the measured path may be."""
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.measurements.clocks import ClockReading
+from rayfix_service.fusion.measurements.directions import Direction
+from rayfix_service.fusion.measurements.likelihood import Term, product, total_variance
+from rayfix_service.fusion.measurements.line_of_sight import sight
+from rayfix_service.fusion.measurements.observations import Observation
+from rayfix_service.fusion.product.factor_kernels import ALL_GOOD, PART, READING, TIME_OUTLIER, make_alternatives
+from rayfix_service.fusion.product.prior import Prior
+from rayfix_service.fusion.product.station_mixture import HeardStation, join
+from rayfix_service.fusion.settings import FusionSettings
+
+_ANY_LENGTH = Term(0.0, 0.0, math.inf)
+"""Likelihood of a path length that was not measured."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Factor:
+    """Alternatives for what one path of the report says of the state z = (x, clock offsets).
+
+    Attributes
+    ----------
+    columns : ndarray of shape (rows, k)
+        One alternative each, as :mod:`rayfix_service.fusion.product.information_form` has them.
+    outlier : ndarray of int8, shape (k,)
+        ALL_GOOD, TIME_OUTLIER or ALL_OUTLIER; the last alternative is always ALL_OUTLIER.
+    """
+
+    columns: NDArray[np.float64]
+    outlier: NDArray[np.int8]
+
+    def __len__(self) -> int:
+        """Return the number of alternatives."""
+        return len(self.outlier)
+
+
+def make_factor(
+    observation: Observation,
+    station: HeardStation,
+    *,
+    num_clocks: int,
+    max_path_length: float,
+    prior: Prior,
+    settings: FusionSettings,
+) -> Factor | None:
+    """Alternatives of one observation, or None where no ray of the table comes.
+
+    Parameters
+    ----------
+    max_path_length : float, m
+        A time that is an outlier may be anything up to this, and noise.
+    prior : Prior
+        Not part of the factor, but of the judgement which alternatives are worth keeping.
+    """
+    said = observation.los_probability
+    seen = None if said is None else sight(said, settings.sight_error)
+    heard, bounds = [], [0]
+    for spread in observation.angle_spreads:
+        heard.append(station.towards(_widened(observation.direction, spread.scale), seen))
+        bounds.append(bounds[-1] + len(heard[-1]))
+    if bounds[-1] == 0:
+        return None
+    # Noise counts, so that a measurement with very much of it does not look like an outlier.
+    log_any_time = 0.0
+    for variance in _variances(observation):
+        log_any_time -= math.log(max_path_length + math.sqrt(2.0 * math.pi * variance))
+    log_good, log_bad = math.log1p(-settings.outlier_probability), math.log(settings.outlier_probability)
+    may_be_late = observation.angle_index is not None and bool(observation.lengths or observation.readings)
+    kinds, readings = _good_kinds(observation, log_good if may_be_late else 0.0, max_path_length)
+    if may_be_late:
+        kinds.append(_Kind(TIME_OUTLIER, log_bad + log_any_time, *_ANY_LENGTH[1:]))
+    parts = [
+        (kind.outlier, bounds[n], bounds[n + 1], log_good + spread.log_weight + kind.log_weight, *kind[2:])
+        for kind in kinds
+        for n, spread in enumerate(observation.angle_spreads)
+    ]
+    columns, outlier = make_alternatives(
+        *join(heard),
+        np.array(parts, PART),
+        np.array(readings, READING),
+        num_clocks,
+        prior.precision,
+        prior.eta,
+        prior.log_volume,
+        log_bad + log_any_time - _log_angle_range(observation),
+        math.log(settings.component_floor),
+        settings.max_divergence,
+    )
+    return Factor(columns=columns, outlier=outlier)
+
+
+class _Kind(NamedTuple):
+    """Alternatives of one kind, as :data:`PART` has them, for Gaussians of any spread."""
+
+    outlier: int
+    log_weight: float
+    length: float
+    length_variance: float
+    log_clocks: float = 0.0
+    first_reading: int = 0
+    last_reading: int = 0
+
+
+def _good_kinds(
+    observation: Observation, log_times_good: float, max_path_length: float
+) -> tuple[list[_Kind], list[tuple[int, float, float]]]:
+    """Alternatives for which all times are what they seem, of each combination of the Gaussians of their errors.
+
+    Also gives the readings of clocks that these take in, as :data:`READING` has them.
+    """
+    # Readings are not in the evidence yet; what each clock will cost, whatever it shows, is its even prior.
+    log_clocks = -len({reading.clock for reading in observation.readings}) * math.log(max_path_length)
+    kinds = []
+    readings: list[tuple[int, float, float]] = []
+    for log_readings, joint in _joint_readings(observation.readings):
+        first, last = len(readings), len(readings) + len(joint)
+        readings += joint
+        for length in _joint_lengths(observation):
+            log_weight = log_times_good + log_readings + length.log_weight
+            kinds.append(_Kind(ALL_GOOD, log_weight, length.value, length.variance, log_clocks, first, last))
+    return kinds, readings
+
+
+def _joint_lengths(observation: Observation) -> list[Term]:
+    """Gaussians over the path length that all measured lengths together make."""
+    if not observation.lengths:
+        return [_ANY_LENGTH]
+    return [product(terms, observation.length_bias_variance) for terms in itertools.product(*observation.lengths)]
+
+
+def _joint_readings(readings: tuple[ClockReading, ...]) -> list[tuple[float, list[tuple[int, float, float]]]]:
+    """Combine the Gaussians that readings may be of, each time with the logarithm of the probability."""
+    if not readings:
+        return [(0.0, [])]
+    return [
+        (
+            sum([spread.log_weight for spread in spreads]),
+            [(r.clock, r.offset, r.variance * s.scale**2) for r, s in zip(readings, spreads, strict=True)],
+        )
+        for spreads in itertools.product(*(reading.spreads for reading in readings))
+    ]
+
+
+def _variances(observation: Observation) -> list[float]:
+    """Variance of each time of an observation, m2, whichever Gaussian it is of."""
+    lengths = [total_variance(terms) + observation.length_bias_variance for terms in observation.lengths]
+    readings = [
+        r.variance * sum([math.exp(spread.log_weight) * spread.scale**2 for spread in r.spreads])
+        for r in observation.readings
+    ]
+    return lengths + readings
+
+
+def _widened(measured: Direction, scale: float) -> Direction:
+    return measured if scale == 1.0 else replace(measured, cov=scale**2 * measured.cov)
+
+
+def _log_angle_range(observation: Observation) -> float:
+    """Logarithm of the range over which an angle that is an outlier is spread evenly, in the units of the factor."""
+    if observation.angle_index is None:
+        return 0.0
+    return math.log(2.0 * math.pi if observation.direction.zenith is None else 4.0 * math.pi)

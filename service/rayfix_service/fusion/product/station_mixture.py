@@ -1,0 +1,172 @@
+"""What a station's part of the table says of a measured direction, as Gaussians over (position, path length)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.lookup.lookup import Lookup, look_up
+from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
+from rayfix_service.fusion.measurements.line_of_sight import Sight
+from rayfix_service.fusion.product.merging import merge_gaussians
+from rayfix_tables.gaussians.conditioning import condition_on_angle
+from rayfix_tables.table import StationPart
+
+_RANGE_STDEV = 0.1
+"""Noise of path lengths, m, under which paths of all directions are told apart."""
+
+_MAX_DIVERGENCE = 1e-4
+"""What merging two of them may cost, nats: a path length picks a small part of them all."""
+
+
+class Heard(NamedTuple):
+    """Weighted Gaussians over (x, path length).
+
+    Attributes
+    ----------
+    log_evidence : ndarray of shape (k,)
+    mean : ndarray of shape (k, 4), m
+    cov : ndarray of shape (k, 4, 4), m2
+    """
+
+    log_evidence: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    cov: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return len(self.log_evidence)
+
+    def those(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> "Heard":
+        """Gaussians that an index picks."""
+        return Heard(*(array[index] for array in self))
+
+    def weighed(self, log_weight: NDArray[np.float64] | float) -> "Heard":
+        """Give them more weight, by its logarithm."""
+        return Heard(self.log_evidence + log_weight, self.mean, self.cov)
+
+    def merged(self) -> "Heard":
+        """Merge in place those that no path length tells apart."""
+        return self.those(merge_gaussians(*self, (0.0, 0.0, 0.0, _RANGE_STDEV**2), _MAX_DIVERGENCE))
+
+
+def join(parts: Sequence[Heard]) -> Heard:
+    """Gaussians of all parts."""
+    return parts[0] if len(parts) == 1 else Heard(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+@dataclass(frozen=True)
+class HeardStation:
+    """A station's part of the table, and what follows from it for reports without an angle."""
+
+    part: StationPart
+
+    def towards(self, measured: Direction, sight: Sight | None = None) -> Heard:
+        """Gaussians of the paths from a measured direction; none where no ray comes.
+
+        Parameters
+        ----------
+        sight : Sight, optional
+            What the weights of direct and of reflected paths are multiplied by.
+        """
+        anywhere = measured.azimuth is None and measured.zenith is None
+        if sight is None:
+            return self.everywhere if anywhere else _condition(look_up(self.part.levels, measured))
+        if anywhere:
+            return join([heard.weighed(log) for heard, log in zip(self.everywhere_by_sight, sight, strict=True)])
+        lookup = look_up(self.part.levels, measured)
+        return _condition(lookup).weighed(np.where(is_direct(lookup), *sight))
+
+    @cached_property
+    def everywhere(self) -> Heard:
+        """Gaussians of the paths of all directions, those merged that no path length tells apart."""
+        return _condition(look_up(self.part.levels, NO_DIRECTION)).merged()
+
+    @cached_property
+    def everywhere_by_sight(self) -> tuple[Heard, Heard]:
+        """Direct paths and reflected ones of all directions, either merged like :attr:`everywhere`."""
+        lookup = look_up(self.part.levels, NO_DIRECTION)
+        heard, direct = _condition(lookup), is_direct(lookup)
+        return heard.those(direct).merged(), heard.those(~direct).merged()
+
+
+def _condition(lookup: Lookup) -> Heard:
+    """Condition every component of the cells looked up on the rest of the measured angle."""
+    level = lookup.level
+    return Heard(
+        *_condition_cells(
+            *level.mixture.tubes,
+            level.log_balance,
+            level.cell_offsets,
+            level.cell_log_mass,
+            lookup.cells,
+            np.ascontiguousarray(lookup.rest_mean),
+            np.ascontiguousarray(lookup.rest_cov),
+            lookup.log_factor,
+        )
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _condition_cells(
+    log_weight: Any,
+    u_mean: Any,
+    u_cov: Any,
+    x_mean: Any,
+    jacobian: Any,
+    x_cov: Any,
+    log_balance: Any,
+    cell_offsets: Any,
+    cell_log_mass: Any,
+    cells: Any,
+    rest_mean: Any,
+    rest_cov: Any,
+    log_factor: Any,
+) -> Any:
+    """Make room for the components of some cells, and condition them; the arguments are those of level and lookup."""
+    count = len(cells)
+    begins, ends, log_scale = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
+    total = 0
+    for n in range(count):
+        begins[n], ends[n] = cell_offsets[cells[n]], cell_offsets[cells[n] + 1]
+        log_scale[n] = log_factor[n] + cell_log_mass[cells[n]]
+        total += ends[n] - begins[n]
+    log_evidence, mean, cov = np.empty(total), np.empty((total, 4)), np.empty((total, 4, 4))
+    condition_on_angle(
+        log_weight,
+        u_mean,
+        u_cov,
+        x_mean,
+        jacobian,
+        x_cov,
+        begins,
+        ends,
+        rest_mean,
+        rest_cov,
+        log_scale,
+        log_evidence,
+        mean,
+        cov,
+    )
+    if len(log_balance):
+        place = 0
+        for n in range(count):
+            for k in range(begins[n], ends[n]):
+                log_evidence[place] += log_balance[k]
+                place += 1
+    return log_evidence, mean, cov
+
+
+def is_direct(lookup: Lookup) -> NDArray[np.bool_]:
+    """Tell which components of the cells of a lookup, cell after cell, are of paths without a reflection.
+
+    A component of several paths counts as the one that carries most of it.
+    """
+    offsets = lookup.level.cell_offsets
+    begins, counts = offsets[lookup.cells], offsets[lookup.cells + 1] - offsets[lookup.cells]
+    places = np.repeat(begins - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
+    return np.asarray(lookup.level.mixture.num_reflections[places] == 0)

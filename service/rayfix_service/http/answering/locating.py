@@ -1,0 +1,173 @@
+"""Locating within a request."""
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from time import perf_counter
+from typing import Annotated, Any, NamedTuple
+
+from fastapi import Depends
+from pydantic_core import from_json, to_json
+from starlette.requests import HTTPConnection
+
+from rayfix_service.adapters.adapted import Adapted, error_in_message
+from rayfix_service.adapters.formats import write
+from rayfix_service.adapters.omlox_hub import OmloxHub
+from rayfix_service.fusion.locator import Fused
+from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.http.answering.feed import FixFeed
+from rayfix_service.http.answering.response_options import Wanted
+from rayfix_service.http.answering.served_tables import ServedTable
+from rayfix_service.http.answering.slow_work import SlowFixes, is_slow
+from rayfix_service.http.problems import ProblemError, internal_problem, problem_document, report_problem
+from rayfix_service.http.telemetry.metrics import Metrics
+from rayfix_service.tracking.track import TrackedPosition
+from rayfix_service.wire import fix_to_document, parse_report, report_to_document
+from rayfix_tables.errors import ReportError
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Incoming:
+    """A report with what it was made from.
+
+    Attributes
+    ----------
+    report : Report
+    adapted : Adapted, optional
+        Where it came from, if from another format.
+    document : Mapping or bytes, optional
+        The report as it was posted, if in this project's own format.
+    """
+
+    report: Report
+    adapted: Adapted | None = None
+    document: Mapping[str, Any] | bytes | None = None
+
+    def native_document(self) -> Any:
+        """Return the report as this project's JSON."""
+        if isinstance(self.document, bytes):
+            return from_json(self.document)
+        return report_to_document(self.report) if self.document is None else self.document
+
+
+def native(document: Mapping[str, Any] | bytes) -> Incoming:
+    """Read a report of this project's own format.
+
+    Raises
+    ------
+    ReportError
+        When it cannot be used.
+    """
+    return Incoming(report=parse_report(document), document=document)
+
+
+def foreign(adapted: Adapted) -> Incoming:
+    """Take a report made from a message of another format."""
+    return Incoming(report=adapted.report, adapted=adapted)
+
+
+class Located(NamedTuple):
+    """A fix, the track of its target if that is wanted, and the time that the fix took, s."""
+
+    fix: Fix
+    track: TrackedPosition | None
+    seconds: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answerer:
+    """What answers reports: the figures that it adds to, the feed and hub to tell, threads for slow ones."""
+
+    metrics: Metrics
+    feed: FixFeed
+    slow_fixes: SlowFixes
+    hub: OmloxHub | None
+
+    async def answer(self, table: ServedTable, incoming: Incoming, wanted: Wanted) -> dict[str, Any]:
+        """Locate a report with a table and write the answer as wanted.
+
+        Raises
+        ------
+        ReportError, ProblemError
+            As :meth:`locate` and :meth:`write` do.
+        """
+        return self.write(table, incoming, wanted, await self.locate(table, incoming, wanted))
+
+    async def locate(self, table: ServedTable, incoming: Incoming, wanted: Wanted) -> Located:
+        """Locate a report with a table, and follow its target if that is wanted.
+
+        A fix with an angle takes less than a millisecond or a few, right on the event loop. In the thread pool that
+        FastAPI has for "def" such fixes would wait for each other's GIL; more worker processes use more cores.
+
+        Raises
+        ------
+        ReportError
+            When a station is not in the table, or the target cannot be followed.
+        ProblemError
+            When the fix is slow and the service too busy.
+        """
+        report = incoming.report
+        locate: Callable[[Report], Fix | Fused] = table.locator.fuse if wanted.follows(report) else table.locator.locate
+        start = perf_counter()
+        try:
+            found = await self.slow_fixes.locate(locate, report) if is_slow(report) else locate(report)
+            seconds = perf_counter() - start
+            fix = found.fix if isinstance(found, Fused) else found
+            self.metrics.fix_done(fix, seconds)
+            track = table.tracker.follow(found) if isinstance(found, Fused) else None
+        except ReportError as error:
+            if incoming.adapted is None:
+                raise
+            raise error_in_message(error, incoming.adapted) from None
+        if track is not None:
+            self.metrics.track_done(track.state)
+        return Located(fix, track, seconds)
+
+    def write(self, table: ServedTable, incoming: Incoming, wanted: Wanted, located: Located) -> dict[str, Any]:
+        """Tell who listens of a fix, and write the answer as wanted.
+
+        Raises
+        ------
+        ReportError
+            When the format needs a position and there is none.
+        """
+        fix, track, seconds = located
+        self.feed.publish(table.name, fix.target_id, partial(_event, table.name, incoming, located))
+        site = table.site
+        if self.hub is not None:
+            self.hub.tell(fix, site, track)
+        return write(fix, wanted.output, site, compute_seconds=seconds, adapted=incoming.adapted, track=track)
+
+    async def answer_or_problem(
+        self, table: ServedTable, make: Callable[[], Incoming], wanted: Wanted
+    ) -> dict[str, Any]:
+        """Answer one report of several, with a problem where it cannot be used."""
+        try:
+            return await self.answer(table, make(), wanted)
+        except ReportError as error:
+            return report_problem(error)
+        except ProblemError as error:
+            return problem_document(error.kind, str(error))
+        except Exception:
+            # A defect that one report meets must not cost the other 999 their fix.
+            _log.exception("a report of several failed")
+            return internal_problem()
+
+
+def _event(table: str, incoming: Incoming, located: Located) -> bytes:
+    """Write what the feed tells of a fix."""
+    fix = fix_to_document(located.fix, located.seconds, located.track)
+    return to_json({"table": table, "report": incoming.native_document(), "fix": fix})
+
+
+async def get_answerer(connection: HTTPConnection) -> Answerer:
+    """Return what answers."""
+    answerer: Answerer = connection.app.state.answerer
+    return answerer
+
+
+AnswererDep = Annotated[Answerer, Depends(get_answerer)]

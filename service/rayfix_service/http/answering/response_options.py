@@ -1,0 +1,115 @@
+"""What a request wants of its answers: their format, by query or Accept header, and whether targets are followed."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated
+
+from fastapi import Depends, Query
+from starlette.requests import HTTPConnection
+from starlette.types import Scope
+
+from rayfix_service.adapters.formats import OutputFormat
+from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.http.headers import header
+from rayfix_service.http.settings import ServiceSettings
+
+JSON = "application/json"
+
+MEDIA_TYPES: dict[str, OutputFormat] = {
+    "application/vnd.rayfix+json": "native",
+    "application/vnd.rayfix.3gpp+json": "3gpp",
+    "application/vnd.rayfix.omlox+json": "omlox",
+}
+"""Media types by which an Accept header names a format."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """What a request wants.
+
+    Attributes
+    ----------
+    output : {"native", "3gpp", "omlox"}
+    media_type : str
+        Of the answer.
+    track : bool
+        Whether targets are followed.
+    must_track : bool
+        Whether the request itself says so: a report that cannot be followed is then refused.
+    """
+
+    output: OutputFormat = "native"
+    media_type: str = JSON
+    track: bool = False
+    must_track: bool = False
+
+    def follows(self, report: Report) -> bool:
+        """Whether a report is to be followed."""
+        return self.track and (self.must_track or None not in (report.target_id, report.timestamp))
+
+
+Output = Annotated[
+    OutputFormat | None,
+    Query(
+        description="format of the answer: this service's own (native, the default), 3GPP TS 29.572 local 3D point, or "
+        f"omlox location; the Accept header may name it instead: {', '.join(MEDIA_TYPES)}"
+    ),
+]
+Track = Annotated[
+    bool | None,
+    Query(
+        description="whether to follow targets by their target_id and timestamp, which reports must then have; the "
+        "service's setting unless given"
+    ),
+]
+
+
+async def get_wanted(connection: HTTPConnection, output: Output = None, track: Track = None) -> Wanted:
+    """Read what a request wants."""
+    return wanted_by(connection.scope, connection.app.state.settings, output, track)
+
+
+WantedDep = Annotated[Wanted, Depends(get_wanted)]
+
+
+def wanted_by(
+    scope: Scope, settings: ServiceSettings, output: OutputFormat | None = None, track: bool | None = None
+) -> Wanted:
+    """Return what a request wants by its query, else by its Accept header and the service's settings."""
+    media_type = JSON
+    if output is None:
+        media_type, output = _accepted(header(scope, b"accept"))
+    return _wanted(output, media_type, settings.track if track is None else track, bool(track))
+
+
+@cache
+def _wanted(output: OutputFormat, media_type: str, track: bool, must_track: bool) -> Wanted:
+    return Wanted(output=output, media_type=media_type, track=track, must_track=must_track)
+
+
+def _accepted(accept: str | None) -> tuple[str, OutputFormat]:
+    """Return the first format of the greatest weight that an Accept header names (RFC 9110, 12.5.1), or the native."""
+    if accept is None or "rayfix" not in accept.lower():
+        return JSON, "native"
+    best, most = (JSON, MEDIA_TYPES["application/vnd.rayfix+json"]), 0.0
+    for item in accept.lower().split(","):
+        name, *parameters = (part.strip() for part in item.split(";"))
+        if name == JSON:
+            found: tuple[str, OutputFormat] = (JSON, "native")
+        elif name in MEDIA_TYPES:
+            found = (name, MEDIA_TYPES[name])
+        else:
+            continue
+        weight = next((_weight(text[2:]) for text in parameters if text.startswith("q=")), 1.0)
+        if weight > most:
+            best, most = found, weight
+    return best
+
+
+def _weight(text: str) -> float:
+    """Read a weight, 0 for what is none."""
+    try:
+        weight = float(text)
+    except ValueError:
+        return 0.0
+    return weight if 0.0 <= weight <= 1.0 else 0.0

@@ -1,0 +1,1 @@
+"""Examples and responses of the OpenAPI document."""

@@ -1,0 +1,126 @@
+"""What routes depend on: the tables, and the body of a request.
+
+All dependencies are ``async``, though some wait for nothing: FastAPI sends plain functions to a thread pool,
+which costs more than they do.
+"""
+
+from collections.abc import Awaitable, Callable
+from typing import Annotated
+
+from fastapi import Depends, Query, Request
+from starlette.requests import HTTPConnection
+from starlette.types import Receive, Scope
+
+from rayfix_service.http.answering.served_tables import ServedTable, Tables
+from rayfix_service.http.headers import header
+from rayfix_service.http.problems import (
+    BODY_TOO_LARGE,
+    CONNECTION_ENDED,
+    UNSUPPORTED_MEDIA_TYPE,
+    ProblemError,
+)
+from rayfix_service.http.settings import BodyLimits, ServiceSettings
+
+
+async def get_table(
+    connection: HTTPConnection,
+    table: Annotated[str | None, Query(description="name of the table; needed where there are several")] = None,
+) -> ServedTable:
+    """Return the table that the query names, or end the request with 503, 404 or 422."""
+    tables: Tables = connection.app.state.tables
+    return tables.named(table)
+
+
+TableDep = Annotated[ServedTable, Depends(get_table)]
+
+
+async def get_tables(connection: HTTPConnection) -> Tables:
+    """Return the tables, ready or not."""
+    tables: Tables = connection.app.state.tables
+    return tables
+
+
+TablesDep = Annotated[Tables, Depends(get_tables)]
+
+
+def report_limit(connection: HTTPConnection) -> int:
+    """Return how long a report may be, bytes."""
+    settings: ServiceSettings = connection.app.state.settings
+    return settings.body_limits.report
+
+
+def body_reader(limit_of: Callable[[BodyLimits], int], *, text: bool = False) -> Callable[[Request], Awaitable[bytes]]:
+    """Make the dependency that reads a body, JSON or plain text, within a limit."""
+
+    async def read_dependency(request: Request) -> bytes:
+        limit = limit_of(request.app.state.settings.body_limits)
+        return await read_body(request.scope, request.receive, limit, text=text)
+
+    return read_dependency
+
+
+async def read_body(scope: Scope, receive: Receive, limit: int, *, text: bool = False) -> bytes:
+    """Read the body of a request, JSON or plain text.
+
+    Raises
+    ------
+    ProblemError
+        When it is of another type or longer than ``limit`` bytes, or the connection ends within it.
+    """
+    (_require_text if text else _require_json)(header(scope, b"content-type"))
+    announced = header(scope, b"content-length")
+    if announced is not None and announced.isdecimal() and int(announced) > limit:
+        raise _too_large(limit)
+    chunks, length, more = [], 0, True
+    while more:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            raise ProblemError(CONNECTION_ENDED, "the connection ended within the body")
+        chunks.append(message.get("body", b""))
+        length += len(chunks[-1])
+        if length > limit:  # a chunked body announces nothing
+            raise _too_large(limit)
+        more = message.get("more_body", False)
+    return chunks[0] if len(chunks) == 1 else b"".join(chunks)
+
+
+ReportBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.report))]
+BatchBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.batch))]
+LinesBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.report, text=True))]
+
+
+def _require_json(content_type: str | None) -> None:
+    if content_type == "application/json":  # as nearly all say
+        return
+    media_type = _media_type(content_type)
+    if media_type == "application/json" or (media_type.startswith("application/") and media_type.endswith("+json")):
+        return
+    raise _unsupported(media_type, "JSON", "application/json")
+
+
+def _require_text(content_type: str | None) -> None:
+    media_type = _media_type(content_type)
+    if media_type != "text/plain":
+        raise _unsupported(media_type, "lines of text", "text/plain")
+
+
+def _media_type(content_type: str | None) -> str:
+    return (content_type or "").partition(";")[0].strip().lower()
+
+
+def _unsupported(found: str, what: str, wanted: str) -> ProblemError:
+    return ProblemError(
+        UNSUPPORTED_MEDIA_TYPE,
+        f"the Content-Type is {repr(found[:100]) if found else 'missing'}; "
+        f"send {what} with the header Content-Type: {wanted}",
+        headers={"Accept": wanted},
+    )
+
+
+def _too_large(limit: int) -> ProblemError:
+    # The rest of the body stays unread, so the connection cannot carry another request.
+    return ProblemError(
+        BODY_TOO_LARGE,
+        f"the body is longer than {limit} bytes; send fewer measurements or reports at once",
+        headers={"Connection": "close"},
+    )

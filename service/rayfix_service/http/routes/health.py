@@ -1,0 +1,51 @@
+"""Routes for whoever watches the process."""
+
+from typing import Literal
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import PlainTextResponse
+from pydantic import BaseModel, Field
+
+from rayfix_service.http.problems import NOT_READY, problem_responses
+from rayfix_service.http.routes.dependencies import TablesDep
+
+router = APIRouter(tags=["health"])
+
+
+class Alive(BaseModel):
+    """The process answers."""
+
+    status: Literal["alive"] = "alive"
+
+
+class ReadyTable(BaseModel):
+    """A table that answers."""
+
+    name: str
+    table_id: str = Field(description="SHA-256 of the table's content")
+
+
+class Ready(BaseModel):
+    """All tables are checked and the kernels are compiled."""
+
+    status: Literal["ready"] = "ready"
+    tables: list[ReadyTable]
+
+
+@router.get("/livez", summary="Does the process answer?")
+async def livez() -> Alive:
+    """Answer 200 as soon as the process listens."""
+    return Alive()
+
+
+@router.get("/readyz", summary="Can it locate?", responses=problem_responses(NOT_READY))
+async def readyz(tables: TablesDep) -> Ready:
+    """Answer 200 once all tables are checked and the kernels are compiled, and 503 before."""
+    return Ready(tables=[ReadyTable(name=t.name, table_id=t.locator.table.table_id) for t in tables.all()])
+
+
+@router.get("/metrics", summary="Figures for Prometheus", response_class=PlainTextResponse)
+async def metrics(request: Request) -> Response:
+    """Tell how many requests and fixes there were, how long they took, and which table answers."""
+    text, media_type = request.app.state.metrics.exposition(request.headers.get("accept", ""))
+    return Response(text, headers={"content-type": media_type})

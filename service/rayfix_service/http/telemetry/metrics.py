@@ -1,0 +1,175 @@
+"""Figures for Prometheus; docs/operations.md lists them."""
+
+import os
+from pathlib import Path
+from typing import get_args
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, values
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
+
+from rayfix_service.adapters.omlox_hub import HubOutcome
+from rayfix_service.fusion.posterior.fix import Fix, Status
+from rayfix_service.tracking.track import TrackState
+from rayfix_tables.table import Table
+
+MULTIPROCESS_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
+"""Environment variable of prometheus-client: folder where several processes share their figures."""
+
+_METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
+_SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+
+
+class Metrics:
+    """The figures of one application, in a registry of its own."""
+
+    def __init__(self) -> None:
+        self._registry = CollectorRegistry()
+        self._requests = Counter(
+            "rayfix_http_requests",
+            "HTTP requests by route, method and status",
+            ("route", "method", "status"),
+            registry=self._registry,
+        )
+        self._by_request: dict[tuple[str, str, str], tuple[Counter, Histogram]] = {}
+        self._request_seconds = Histogram(
+            "rayfix_http_request_seconds",
+            "Time from a request's head to the end of its answer",
+            ("route", "method"),
+            buckets=_SECONDS,
+            registry=self._registry,
+        )
+        fixes = Counter("rayfix_fixes", "Fixes by status", ("status",), registry=self._registry)
+        # All that there can be is there from the start, at 0, so that a rate begins with the first.
+        self._fixes = {status: fixes.labels(status) for status in get_args(Status)}
+        self._fusion_seconds = Histogram(
+            "rayfix_fusion_seconds", "Time that a fix took to compute", buckets=_SECONDS, registry=self._registry
+        )
+        measurements = Counter(
+            "rayfix_measurements",
+            "Measurements by what became of them: used, outlier (used, and more likely wrong than not) or unused",
+            ("outcome",),
+            registry=self._registry,
+        )
+        self._measurements = {name: measurements.labels(name) for name in ("used", "outlier", "unused")}
+        tracks = Counter(
+            "rayfix_tracks", "Reports by what they did to their target's track", ("state",), registry=self._registry
+        )
+        self._tracks = {state: tracks.labels(state) for state in get_args(TrackState)}
+        told = Counter(
+            "rayfix_omlox_locations",
+            "Positions for the omlox hub by what became of them: sent, refused by the hub, or dropped",
+            ("outcome",),
+            registry=self._registry,
+        )
+        self._told = {outcome: told.labels(outcome) for outcome in get_args(HubOutcome)}
+        self._table = Gauge(
+            "rayfix_table_info",
+            "1 for each table that answers, 0 for those that did",
+            ("table", "table_id", "site", "format_version", "software_version"),
+            registry=self._registry,
+            multiprocess_mode="livemax",
+        )
+        loads = Counter(
+            "rayfix_table_loads",
+            "Tables loaded and refused, at the start and since",
+            ("outcome",),
+            registry=self._registry,
+        )
+        self._loads = {outcome: loads.labels(outcome) for outcome in ("loaded", "refused")}
+        self._ready = Gauge(
+            "rayfix_ready", "1 once the service can locate", registry=self._registry, multiprocess_mode="livemin"
+        )
+        self._ready.set(0)
+        ProcessCollector(registry=self._registry)
+
+    def request_done(self, route: str, method: str, status: str, seconds: float) -> None:
+        """Count a request."""
+        method = method if method in _METHODS else "other"
+        kind = (route, method, status)
+        if (figures := self._by_request.get(kind)) is None:  # to find them by their labels takes a lock for each
+            figures = self._requests.labels(*kind), self._request_seconds.labels(route, method)
+            self._by_request[kind] = figures
+        requests, request_seconds = figures
+        requests.inc()
+        request_seconds.observe(seconds)
+
+    def fix_done(self, fix: Fix, seconds: float) -> None:
+        """Count a fix and its measurements."""
+        self._fixes[fix.status].inc()
+        self._fusion_seconds.observe(seconds)
+        for outcome in fix.outcomes:
+            name = "unused" if not outcome.used else "outlier" if (outcome.outlier_probability or 0) > 0.5 else "used"
+            self._measurements[name].inc()
+
+    def track_done(self, state: TrackState) -> None:
+        """Count a report that was taken into a track."""
+        self._tracks[state].inc()
+
+    def hub_told(self, outcome: HubOutcome) -> None:
+        """Count a position for the omlox hub."""
+        self._told[outcome].inc()
+
+    def table_loaded(self, name: str, table: Table) -> None:
+        """Tell that a table answers."""
+        self._table.labels(*_table_labels(name, table)).set(1)
+        self._loads["loaded"].inc()
+
+    def table_left(self, name: str, table: Table) -> None:
+        """Tell that a table does no longer answer."""
+        self._table.labels(*_table_labels(name, table)).set(0)
+
+    def table_refused(self) -> None:
+        """Tell that a table did not pass its check."""
+        self._loads["refused"].inc()
+
+    def became_ready(self) -> None:
+        """Tell that the service can locate."""
+        self._ready.set(1)
+
+    def exposition(self, accept: str) -> tuple[bytes, str]:
+        """Write all figures, those of the other worker processes included; returns text and media type.
+
+        Parameters
+        ----------
+        accept : str
+            The request's Accept header.
+        """
+        registry = self._registry
+        if MULTIPROCESS_VARIABLE in os.environ:
+            registry = CollectorRegistry()
+            MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
+        encode, media_type = choose_encoder(accept)
+        return encode(registry), media_type
+
+
+def _table_labels(name: str, table: Table) -> tuple[str, ...]:
+    return (name, table.table_id, table.site.name, str(table.format_version), table.software_version)
+
+
+def share_figures() -> None:
+    """Keep figures that are made from now on where ``MULTIPROCESS_VARIABLE`` says, in files of this process.
+
+    prometheus-client looks whether it is set when it is imported, which is before there are workers.
+    """
+    values.ValueClass = values.get_value_class()  # type: ignore[no-untyped-call]
+
+
+def forget_dead_workers() -> None:
+    """Take out of the shared folder what processes that have ended said of the present."""
+    folder = os.environ.get(MULTIPROCESS_VARIABLE)
+    if folder is None:
+        return
+    for pid in {path.stem.rpartition("_")[2] for path in Path(folder).glob("gauge_live*.db")}:
+        if not _is_alive(int(pid)):
+            mark_process_dead(pid, folder)  # type: ignore[no-untyped-call]
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # alive, and another user's
+        pass
+    return True

@@ -1,0 +1,92 @@
+"""What surrounds every request: its identifier, its place in log and figures, and an answer whatever goes wrong."""
+
+import logging
+import re
+from contextvars import ContextVar
+from itertools import count
+from secrets import token_hex
+from time import perf_counter
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from rayfix_service.http.headers import header
+from rayfix_service.http.problems import internal_problem, problem_response
+from rayfix_service.http.telemetry.metrics import Metrics
+
+HEADER = "X-Request-ID"
+_RAW_HEADER = HEADER.lower().encode()
+
+REQUEST_ID: ContextVar[str | None] = ContextVar("REQUEST_ID", default=None)
+"""Identifier of the request under way."""
+
+ACCESS_LOGGER = "rayfix_service.access"
+"""Logger of a line per request; silent unless its level is INFO."""
+
+_access = logging.getLogger(ACCESS_LOGGER)
+_log = logging.getLogger(__name__)
+
+_PROPER = re.compile(r"[A-Za-z0-9._:/+=-]{1,128}")
+
+
+class RequestContext:
+    """Middleware around all others.
+
+    It gives each request an identifier, the client's own if it sent a proper one, and echoes it; counts the request and
+    logs it; and logs an exception that nobody handled, once, with a problem for answer unless there is one. Starlette
+    answers those of routes by the handler for Exception and raises them again; the server would log them then.
+    """
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+        self._numbers = count()
+        self._prefix = token_hex(10)  # of this process: a random number for each request costs a system call
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        identifier = self._identifier(scope)
+        status, answered = 0, False
+
+        async def send_noting(message: Message) -> None:
+            nonlocal status, answered
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                message["headers"] = [*message.get("headers", ()), (_RAW_HEADER, identifier.encode())]
+            elif message["type"] == "http.response.body":
+                answered = not message.get("more_body", False)
+            await send(message)
+
+        token = REQUEST_ID.set(identifier)
+        start = perf_counter()
+        try:
+            await self._app(scope, receive, send_noting)
+        except Exception:
+            if status and not answered:
+                raise  # only the server can cut the connection, and it logs
+            _log.exception("request %s %s failed", scope["method"], scope["path"])
+            if not status:
+                await problem_response(internal_problem())(scope, receive, send_noting)
+        finally:
+            self._note(scope, str(status or "none"), perf_counter() - start, identifier)
+            REQUEST_ID.reset(token)
+
+    def _identifier(self, scope: Scope) -> str:
+        """Take the client's identifier where it is fit for a log, else make one."""
+        given = header(scope, _RAW_HEADER)
+        if given is not None and _PROPER.fullmatch(given):
+            return given
+        return f"{self._prefix}{next(self._numbers):012x}"
+
+    def _note(self, scope: Scope, status: str, seconds: float, identifier: str) -> None:
+        """Count a request, and log it if that is wanted; the status is "none" where the client left before it."""
+        # Only the route's template: the path is the client's, and a figure for each would be without end.
+        route = getattr(scope.get("route"), "path", "none")
+        self._metrics.request_done(route, scope["method"], status, seconds)
+        if _access.isEnabledFor(logging.INFO):
+            fields = {"method": scope["method"], "path": scope["path"], "status": status, "seconds": round(seconds, 6)}
+            line = "%s %s %s in %.1f ms, request %s"
+            arguments = (scope["method"], scope["path"], status, 1e3 * seconds, identifier)
+            _access.info(line, *arguments, extra={"fields": fields})

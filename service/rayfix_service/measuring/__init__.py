@@ -1,0 +1,1 @@
+"""Ranges from what receivers measure: times, signal strengths and impulse responses."""

@@ -1,0 +1,1 @@
+"""The application composed of its parts, and the processes that serve it."""

@@ -1,0 +1,241 @@
+"""The web application."""
+
+import asyncio
+import gc
+import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.middleware.cors import CORSMiddleware
+from pydantic.json_schema import models_json_schema
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from rayfix_service.adapters.nrppa_documents import NrppaDocument
+from rayfix_service.adapters.omlox_hub import open_hub
+from rayfix_service.adapters.silabs import SilabsDocument
+from rayfix_service.http.access.guard import Access, describe_access
+from rayfix_service.http.access.keys import ApiKeys
+from rayfix_service.http.access.rates import Accounts, RateLimit
+from rayfix_service.http.answering.feed import FixFeed
+from rayfix_service.http.answering.feed_relay import FeedRelay
+from rayfix_service.http.answering.locating import Answerer
+from rayfix_service.http.answering.served_tables import ServedTable, Tables
+from rayfix_service.http.answering.slow_work import SlowFixes
+from rayfix_service.http.errors import ServiceError
+from rayfix_service.http.problems import Problem, install_problems
+from rayfix_service.http.routes import formats, health, positions, stream, table
+from rayfix_service.http.routes.stream import FixEventDocument
+from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.http.telemetry.metrics import Metrics, forget_dead_workers
+from rayfix_service.http.telemetry.request_context import HEADER, RequestContext
+from rayfix_service.server.fast_path import ShortWay
+from rayfix_service.server.stopping import on_stop_signal
+from rayfix_service.web import routes_assets, routes_scene, routes_simulation
+from rayfix_service.web.documents import SimulationRequest
+from rayfix_service.web.table_cache import PerTable
+from rayfix_service.wire import BatchDocument, ReportDocument
+
+_log = logging.getLogger(__name__)
+
+_DESCRIPTION = """\
+Indoor positions from angles and times of arrival, fused with a digital twin of the building.
+
+Coordinates are in the scene frame of the site, right-handed, z up, in metres. An azimuth counts
+counter-clockwise from the frame's +x axis, a zenith angle from straight up; both are of the direction from
+the station towards the incoming ray. Every error is a problem document (RFC 9457) that names the field.
+"""
+
+
+class RayfixApp(FastAPI):
+    """FastAPI with this service's middlewares around all that FastAPI has.
+
+    What they answer by themselves goes past FastAPI's own middlewares, which take 4 us of each request. The OpenAPI
+    document also has the schemas of the bodies that the routes read themselves.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._outermost: ASGIApp = super().__call__
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+        await self._outermost(scope, receive, send)
+
+    def surround(self, middleware: Callable[..., ASGIApp], **options: Any) -> None:
+        """Put a middleware around all that there is."""
+        self._outermost = middleware(self._outermost, **options)
+
+    def openapi(self) -> dict[str, Any]:
+        """Return the OpenAPI document."""
+        if self.openapi_schema is None:
+            document = super().openapi()
+            _, schemas = models_json_schema(
+                [
+                    (ReportDocument, "validation"),
+                    (BatchDocument, "validation"),
+                    (NrppaDocument, "validation"),
+                    (SilabsDocument, "validation"),
+                    (FixEventDocument, "validation"),
+                    (SimulationRequest, "validation"),
+                    (Problem, "serialization"),
+                ],
+                ref_template="#/components/schemas/{model}",
+            )
+            document["components"]["schemas"].update(schemas["$defs"])
+            describe_access(document)
+            self.openapi_schema = document
+        return self.openapi_schema
+
+
+def create_app(
+    tables_path: Path,
+    settings: ServiceSettings | None = None,
+    *,
+    at_hand: dict[str, ServedTable] | None = None,
+    accounts: Accounts | None = None,
+) -> FastAPI:
+    """Make the web application that answers from one table or several.
+
+    It listens at once; ``/livez`` answers. Meanwhile a thread verifies the tables and compiles the kernels; then
+    ``/readyz`` turns 200 and the other routes answer. Afterwards it watches the tables' files.
+
+    Parameters
+    ----------
+    tables_path : pathlib.Path
+        The table, or a folder of tables. One that does not pass its check leaves the application not ready.
+    settings : ServiceSettings, optional
+    at_hand : dict of str to ServedTable, optional
+        Tables that are verified already, by name; they answer at once. The application takes them out.
+    accounts : Accounts, optional
+        Of the clients' rates, which several processes may share.
+
+    Raises
+    ------
+    ServiceError
+        When the key file cannot be used.
+    """
+    settings = settings or ServiceSettings()
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        state = app.state
+        state.tables = tables = Tables(
+            tables_path, state.metrics, runtime_folder=settings.runtime_folder, at_hand=at_hand
+        )
+        keeping = [asyncio.create_task(tables.keep(settings.watch_seconds))]
+        if keys is not None:
+            keeping.append(asyncio.create_task(_keep_keys(keys, settings.watch_seconds)))
+        if settings.own_process:
+            keeping.append(asyncio.create_task(_freeze(tables)))
+        if settings.runtime_folder is not None:
+            state.relay = FeedRelay(state.feed, settings.runtime_folder)
+            keeping.append(asyncio.create_task(state.relay.keep()))
+        state.slow_fixes = SlowFixes(
+            threads=settings.slow_fix_threads, waiting=settings.slow_fixes_waiting, seconds=settings.fix_seconds
+        )
+        stopping = asyncio.Event()
+
+        def stop() -> None:
+            stopping.set()
+            state.feed.close()
+
+        try:
+            with on_stop_signal(stop):
+                async with open_hub(settings.hub, on_outcome=state.metrics.hub_told) as hub:
+                    state.answerer = Answerer(
+                        metrics=state.metrics, feed=state.feed, slow_fixes=state.slow_fixes, hub=hub
+                    )
+                    if settings.runtime_folder is not None:
+                        forget_dead_workers()
+                        await _take_turn(tables, settings.runtime_folder / "ready", stopping)
+                    yield
+        finally:
+            stop()
+            for task in keeping:
+                task.cancel()
+            await asyncio.wait(keeping)
+            state.slow_fixes.close()
+
+    app = RayfixApp(
+        title="rayfix",
+        description=_DESCRIPTION,
+        version="1",
+        lifespan=lifespan,
+        docs_url=None,  # FastAPI's own page gets its script from elsewhere; routes_assets has one that does not
+        redoc_url=None,
+        redirect_slashes=False,  # a redirected POST loses its body in many clients; a 404 is clear
+        # The figures are those of /metrics; and to ask at each request whether others are wanted takes long.
+        telemetry={"tracing": False, "metrics": False, "logs": False},
+    )
+    app.state.settings = settings
+    app.state.per_table = PerTable()
+    app.state.metrics = Metrics()
+    app.state.feed = FixFeed()
+    app.state.relay = None
+    keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
+    app.state.rate_limit = limit = _rate_limit(settings, accounts)
+    install_problems(app)
+    app.surround(ShortWay, path="/v1/positions", answer=partial(positions.answer_position, app.state))
+    app.surround(Access, keys=keys, limit=limit)
+    if settings.cors_origins:
+        # Around the access control, since a browser asks without a key whether it may send one.
+        app.surround(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=["Authorization", "Content-Type", "X-API-Key", HEADER],
+            expose_headers=["Retry-After", HEADER],
+        )
+    app.surround(RequestContext, metrics=app.state.metrics)
+    app.include_router(positions.router)
+    app.include_router(formats.router)
+    app.include_router(stream.router)
+    app.include_router(table.router)
+    app.include_router(health.router)
+    app.include_router(routes_scene.router)
+    app.include_router(routes_simulation.router)
+    app.include_router(routes_assets.router)
+    return app
+
+
+def _rate_limit(settings: ServiceSettings, accounts: Accounts | None) -> RateLimit | None:
+    rate = settings.reports_per_second
+    return None if rate is None else RateLimit(rate, max(1.0, rate * settings.burst_seconds), accounts=accounts)
+
+
+async def _keep_keys(keys: ApiKeys, seconds: float) -> None:
+    """Read the keys again from time to time; while their file cannot be used, those that were go on."""
+    failure = ""
+    while True:
+        await asyncio.sleep(seconds)
+        try:
+            await asyncio.to_thread(keys.reread)
+        except ServiceError as error:
+            if failure != (failure := str(error)):
+                _log.error("keys not read again: %s", error)
+        else:
+            failure = ""
+
+
+async def _freeze(tables: Tables) -> None:
+    """Let the garbage collector leave alone what is there once the process can locate."""
+    await tables.became_ready.wait()
+    gc.collect()
+    gc.freeze()
+
+
+async def _take_turn(tables: Tables, marker: Path, stopping: asyncio.Event) -> None:
+    """Let a worker that replaces another listen only once it can locate.
+
+    Until then the others take all connections. Of the first workers none waits, so that ``/livez`` answers; a file in
+    the folder that they share tells that there was one that could locate.
+    """
+    if marker.exists():
+        waiting = [asyncio.create_task(event.wait()) for event in (tables.became_ready, stopping)]
+        await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+        for task in waiting:
+            task.cancel()

@@ -1,0 +1,227 @@
+"""Serve tables over HTTP."""
+
+import asyncio
+import gc
+import ipaddress
+import logging
+import os
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import NamedTemporaryFile, TemporaryDirectory
+
+import uvicorn
+
+from rayfix_service.http.access.keys import read_key_file
+from rayfix_service.http.access.rates import Accounts
+from rayfix_service.http.answering.served_tables import forget_changed, load_tables
+from rayfix_service.http.errors import ServiceError
+from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.http.telemetry.logs import LogFormat, log_config
+from rayfix_service.http.telemetry.metrics import MULTIPROCESS_VARIABLE, share_figures
+from rayfix_service.server.app import create_app
+from rayfix_service.server.protocol import GatheringProtocol
+from rayfix_service.server.workers import COULD_NOT_START, run_workers
+from rayfix_tables.errors import RayfixError
+
+_MAX_MESSAGE = 16 << 20  # bytes; up to here a message that is too long is answered, beyond it ends the connection
+_FIGURES_BYTES = 8 << 20  # of some workers
+_SHUTDOWN_SECONDS = 10  # for requests under way; a full batch takes about one
+_ARRIVING_SECONDS = 0.2  # for requests that are on the way to this process when it is told to end
+
+_TRACKS = (
+    "each of the %d workers follows targets by itself, and the system chooses who answers a connection: a target's "
+    "reports belong on one connection; else serve with one worker on each of several ports, balanced by target_id"
+)
+
+_log = logging.getLogger(__name__)
+
+
+def serve(
+    tables_path: str | Path,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    workers: int = 1,
+    log_format: LogFormat = "text",
+    access_log: bool = False,
+    settings: ServiceSettings | None = None,
+) -> None:
+    """Serve tables until the process is told to end (SIGINT, SIGTERM); requests under way are finished.
+
+    Parameters
+    ----------
+    tables_path : str or pathlib.Path
+        A table, or a folder of tables ``*.h5``.
+    host : str
+        Name or address to listen on; ``0.0.0.0`` is every IPv4 interface.
+    port : int
+        TCP port; 0 takes a free one, which the log names.
+    workers : int
+        Processes that share the port and, since they are forked once the tables are loaded, most of their memory.
+    log_format : {"text", "json"}
+        JSON is an object a line.
+    access_log : bool
+        Whether to log a line per request. It costs more than it tells, with a hundred targets at 5 Hz.
+    settings : ServiceSettings, optional
+
+    Raises
+    ------
+    TableError
+        When a table is missing, of another format, or damaged.
+    ServiceError
+        When the port is taken, an argument is out of range, the keys are missing, or the folder for figures cannot be
+        written to.
+    """
+    path = Path(tables_path).absolute()
+    settings = replace(settings or ServiceSettings(), own_process=True)
+    if workers < 1:
+        raise ServiceError(f"workers is {workers}; give at least 1")
+    if settings.api_keys is not None:
+        read_key_file(settings.api_keys)
+    elif not is_loopback(host):
+        raise ServiceError(
+            f"host {host} can be reached from other machines, so that API keys are needed; make one with "
+            "'rayfix api-key NAME -o FILE' and give --api-keys FILE, or listen on 127.0.0.1"
+        )
+    check_address(host, port)
+    with ExitStack() as stack:
+        if workers > 1:
+            settings = replace(settings, runtime_folder=stack.enter_context(_runtime_folder()))
+        if MULTIPROCESS_VARIABLE in os.environ:
+            _check_room(Path(os.environ[MULTIPROCESS_VARIABLE]))
+        at_hand = load_tables(path)
+        config = uvicorn.Config(
+            partial(create_app, path, settings, at_hand=at_hand, accounts=Accounts()),
+            factory=True,
+            host=host,
+            port=port,
+            http=GatheringProtocol,
+            ws_max_size=_MAX_MESSAGE,
+            ws_per_message_deflate=False,  # costs more than it saves, on messages of a kilobyte
+            timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
+            server_header=False,
+            access_log=False,  # this package has one of its own
+            log_config=log_config(log_format, access_log=access_log),
+        )
+        if workers == 1:
+            with suppress(KeyboardInterrupt):
+                _run(config)
+            return
+        if settings.track:
+            _log.warning(_TRACKS, workers)
+        gc.collect()
+        gc.freeze()  # a collection would write to what the workers share, and so copy it
+        with config.bind_socket() as bound:
+            run_workers(
+                partial(_work, config, bound),
+                count=workers,
+                meanwhile=partial(forget_changed, at_hand),
+                ending=bound.close,  # or the system would take connections that nobody answers
+            )
+
+
+def _work(config: uvicorn.Config, bound: socket.socket) -> None:
+    """Be one of several processes that answer at an address."""
+    share_figures()
+    try:
+        _run(config, bound)
+    except RayfixError as error:
+        _log.critical("a worker cannot start: %s", error)
+        sys.exit(COULD_NOT_START)
+
+
+def _run(config: uvicorn.Config, *bound: socket.socket) -> None:
+    """Answer requests until the process is told to end."""
+    server = _Server(config)
+    server.run(list(bound) or None)
+    if not server.started:
+        sys.exit(COULD_NOT_START)
+
+
+class _Server(uvicorn.Server):
+    """A server that answers what was sent before it was told to end.
+
+    Such a request may wait in a connection that is not yet accepted or read, and uvicorn would close that.
+    """
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Take what has arrived, then stop listening and finish what is under way."""
+        await asyncio.sleep(_ARRIVING_SECONDS)
+        await super().shutdown(sockets)
+
+
+@contextmanager
+def _runtime_folder() -> Iterator[Path]:
+    """Make the folder that workers share, with a place for their figures unless the environment names one."""
+    try:
+        folder = TemporaryDirectory(prefix="rayfix-")
+    except OSError as error:
+        raise ServiceError(
+            f"the workers need a temporary folder and there is none ({error.strerror}); set TMPDIR to one"
+        ) from None
+    with folder as name, ExitStack() as stack:
+        if MULTIPROCESS_VARIABLE not in os.environ:
+            # Whichever worker is asked answers for all.
+            (Path(name) / "metrics").mkdir()
+            os.environ[MULTIPROCESS_VARIABLE] = str(Path(name) / "metrics")
+            stack.callback(os.environ.pop, MULTIPROCESS_VARIABLE)
+        yield Path(name)
+
+
+def _check_room(folder: Path) -> None:
+    """Check that workers can write their figures.
+
+    They map sparse files there: where there is no room, the first page that lacks ends the process with a signal.
+    """
+    try:
+        with NamedTemporaryFile(dir=folder, prefix="rayfix-") as file:
+            os.posix_fallocate(file.fileno(), 0, _FIGURES_BYTES)
+    except OSError as error:
+        raise ServiceError(
+            f"{MULTIPROCESS_VARIABLE} is {folder}, where figures cannot be written ({error.strerror}); "
+            "make room there or give another folder"
+        ) from None
+
+
+def check_address(host: str, port: int) -> None:
+    """Check that a server can listen there.
+
+    Raises
+    ------
+    ServiceError
+        When it cannot.
+    """
+    if not 0 <= port <= 65535:
+        raise ServiceError(f"port is {port}; give one from 0 to 65535")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+    except (OSError, UnicodeError):
+        raise ServiceError(f"host {host!r} is no address of this machine; try 127.0.0.1 or 0.0.0.0") from None
+    with socket.socket(family, kind, protocol) as probe:
+        # As the server will do: a port that merely cools down after its last server is free.
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(address)
+            probe.listen()
+        except PermissionError:
+            raise ServiceError(f"port {port} needs administrator rights; give one from 1024 on") from None
+        except OSError as error:
+            raise ServiceError(
+                f"cannot listen on {host} port {port} ({error.strerror}); end what uses it or give another"
+            ) from None
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether only this machine reaches a host's address."""
+    try:
+        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError):
+        return False
+    return all(ipaddress.ip_address(str(address[0]).partition("%")[0]).is_loopback for *_, address in found)

@@ -1,0 +1,1 @@
+"""Compiled operations on Gaussians that building and locating share."""

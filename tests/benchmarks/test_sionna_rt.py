@@ -1,0 +1,72 @@
+"""The forward solver beside Sionna RT, and the comparison itself."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from benchmarks.sionna_rt import NOTHING_COMPARED, FoundPaths, compare, shortest_segment, sionna_paths
+from rayfix_evaluation.truth.forward import ForwardSolver
+from rayfix_tables.angles import direction
+
+STATIONS = np.array([[0.5, 0.6, 2.6], [3.6, 4.4, 2.3]])
+POINTS = np.array([[1.6, 3.4, 1.1], [3.0, 1.2, 0.4]])
+
+
+@pytest.fixture(scope="module")
+def room() -> trimesh.Trimesh:
+    """Make a room with a screen in it."""
+    walls = trimesh.creation.box(bounds=[(0, 0, 0), (4, 5, 3)])
+    screen = trimesh.creation.box(bounds=[(1.9, 0.5, 0.2), (2.1, 3.5, 2.0)])
+    return trimesh.util.concatenate([walls, screen])
+
+
+def solver_of(room: trimesh.Trimesh) -> ForwardSolver:
+    return ForwardSolver.from_mesh(room.vertices, room.faces, max_reflections=2, max_path_length=1e4)
+
+
+def test_all_paths_are_those_of_sionna_rt(room: trimesh.Trimesh) -> None:
+    pytest.importorskip("sionna.rt", reason="Sionna RT is not here; install the extra 'sionna' and LLVM")
+    solver = solver_of(room)
+    theirs = sionna_paths(room.vertices, room.faces, STATIONS, POINTS, max_reflections=2)
+    total = NOTHING_COMPARED
+    for point, by_station in zip(POINTS, theirs, strict=True):
+        for station, found in zip(STATIONS, by_station, strict=True):
+            total += compare(solver.paths(station, point), found)
+    assert total.num_common > 40
+    assert (total.only_ours, total.only_theirs) == (0, 0)
+    assert total.largest_length < 1e-4
+    assert total.largest_angle < np.deg2rad(0.01)
+
+
+def test_paths_are_matched_one_to_one(room: trimesh.Trimesh) -> None:
+    ours = solver_of(room).paths(STATIONS[0], POINTS[0])
+    order = np.random.default_rng(1).permutation(len(ours))
+    same = FoundPaths(path_length=ours.path_length[order] + 2e-4, direction=direction(ours.azimuth, ours.zenith)[order])
+    told = compare(ours, same)
+    assert told.num_common == len(ours)
+    assert told.largest_length == pytest.approx(2e-4, abs=1e-9)
+    assert told.largest_angle < 1e-9
+    assert (told.short_segments, told.only_ours, told.only_theirs) == (0, 0, 0)
+
+    twice = FoundPaths(path_length=same.path_length[[0, 0]], direction=same.direction[[0, 0]])
+    told = compare(ours, twice)
+    assert (told.num_common, told.only_ours, told.only_theirs) == (1, len(ours) - 1, 1)
+    longer = FoundPaths(path_length=same.path_length + 2e-3, direction=same.direction)
+    assert compare(ours, longer).num_common < len(ours)
+    nothing = FoundPaths(path_length=np.empty(0), direction=np.empty((0, 3)))
+    assert compare(ours, nothing).only_ours == len(ours)
+    both = told + compare(ours, nothing)
+    assert (both.num_common, both.only_ours, both.only_theirs) == (1, 2 * len(ours) - 1, 1)
+
+
+def test_short_segments_are_told_apart() -> None:
+    """A point 4 mm before a wall: the reflection there has a segment of about that length."""
+    wall = ForwardSolver.from_mesh(
+        [(0, -50, -50), (0, 50, -50), (0, 50, 50), (0, -50, 50)], [(0, 1, 2), (0, 2, 3)], max_path_length=1e4
+    )
+    paths = wall.paths((3.0, 0.0, 0.0), (0.004, 0.1, 0.0))
+    assert paths.num_reflections.tolist() == [0, 1]
+    assert shortest_segment(paths, 1) == pytest.approx(0.004 * np.hypot(1.0, 0.1 / 3.004), rel=1e-3)
+    direct = FoundPaths(path_length=paths.path_length[:1], direction=direction(paths.azimuth, paths.zenith)[:1])
+    told = compare(paths, direct)
+    assert (told.num_common, told.short_segments, told.only_ours) == (1, 1, 0)

@@ -1,0 +1,140 @@
+"""u-blox lines: real samples, the manual's fields, joining, refusals."""
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rayfix_service.adapters.ublox import UudfEvent, parse_ublox, parse_uudf
+from rayfix_service.fusion.measurements.report import Angle
+from rayfix_service.wire import InvalidReportError
+from tests.support.checkout import SHARED
+
+NINE = '+UUDF:6C1DEBA5F60C,-53,8,2,0,37,"6C1DEBA09862","",1437347'
+TEN = '+UUDF:F4CE5FC91A6A,-50,0,20,0,20,"CD84C98B935D","",238777,40871'
+
+
+def line(tag: str, anchor: str, sequence: int | None = None, azimuth: int = 10, elevation: int = -5) -> str:
+    end = "" if sequence is None else f",{sequence}"
+    return f'+UUDF:{tag},-53,{azimuth},{elevation},0,37,"{anchor}","",1437347{end}'
+
+
+def test_nine_fields():
+    assert parse_uudf(NINE) == UudfEvent(
+        tag="6C1DEBA5F60C",
+        rssi=-53,
+        azimuth=8,
+        elevation=2,
+        channel=37,
+        anchor="6C1DEBA09862",
+        timestamp_ms=1437347,
+        sequence=None,
+    )
+
+
+def test_ten_fields_and_white_space():
+    event = parse_uudf(f"\r\n {TEN} \r\n")
+    assert (event.azimuth, event.elevation, event.anchor, event.sequence) == (0, 20, "CD84C98B935D", 40871)
+
+
+def test_a_users_text_may_hold_commas():
+    event = parse_uudf('+UUDF:6C1DEBA5F60C,-53,8,2,0,37,"6C1DEBA09862","48.1,7.8",1437347')
+    assert event.timestamp_ms == 1437347
+
+
+def test_real_samples():
+    path = SHARED / "formats" / "ublox_uudf_lines.txt"
+    if not path.is_file():
+        pytest.skip("the folder ../shared/formats with real samples is not here")
+    reports = parse_ublox(path.read_bytes())
+    assert [adapted.report.target_id for adapted in reports] == ["6C1DEBA5F60C", "F4CE5FC91A6A", "6C1DEBA4241B"]
+    angles = [adapted.report.measurements[0] for adapted in reports]
+    assert [angle.station_id for angle in angles] == ["6C1DEBA09862", "CD84C98B935D", "CCF9579B21AE"]
+    azimuths = [math.degrees(angle.azimuth) for angle in angles if isinstance(angle, Angle)]
+    assert azimuths == pytest.approx([-8, 0, -26], abs=1e-9)
+
+
+@settings(deadline=None)
+@given(st.integers(-90, 90), st.integers(-90, 90))
+def test_right_of_the_boresight_is_a_negative_azimuth(azimuth: int, elevation: int):
+    (adapted,) = parse_ublox(line("tag", "anchor", azimuth=azimuth, elevation=elevation), stations={"anchor": "bs1"})
+    (angle,) = adapted.report.measurements
+    assert isinstance(angle, Angle)
+    assert (angle.station_id, angle.frame) == ("bs1", "lcs")
+    assert angle.zenith is not None
+    assert math.degrees(-angle.azimuth) == pytest.approx(azimuth, abs=1e-9)
+    assert 90 - math.degrees(angle.zenith) == pytest.approx(elevation, abs=1e-9)
+    assert (angle.azimuth_stdev, angle.zenith_stdev) == (math.radians(5), math.radians(5))
+
+
+def stations(text: str) -> list[tuple[str | None, list[str], list[int]]]:
+    """Tell what the lines are joined to: tag, stations and line numbers of each report."""
+    return [
+        (
+            adapted.report.target_id,
+            [m.station_id for m in adapted.report.measurements],
+            [int(source[1]) for source in adapted.sources],
+        )
+        for adapted in parse_ublox(text)
+    ]
+
+
+def test_lines_are_joined_by_tag_and_sequence_number():
+    text = "\n".join(
+        [
+            line("t1", "a", 1),
+            line("t2", "a", 1),
+            "+STARTUP",
+            line("t1", "b", 2),
+            line("t1", "b", 1),
+            line("t1", "a", 2),
+            "",
+            line("t2", "c", 1),
+        ]
+    )
+    assert stations(text) == [
+        ("t1", ["a", "b"], [0, 4]),
+        ("t2", ["a", "c"], [1, 7]),
+        ("t1", ["b", "a"], [3, 5]),
+    ]
+
+
+def test_without_sequence_number_an_anchor_that_speaks_again_begins_anew():
+    text = "\n".join([line("t", "a"), line("t", "b"), line("u", "a"), line("t", "b"), line("t", "a"), line("t", "a")])
+    assert stations(text) == [
+        ("t", ["a", "b"], [0, 1]),
+        ("u", ["a"], [2]),
+        ("t", ["b", "a"], [3, 4]),
+        ("t", ["a"], [5]),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("+UUDF:a,b", "line 1 has 2 fields; give 9, or 10 with the sequence number"),
+        (f"\n{line('t', 'a')},1,2", "line 2 has 11 fields"),
+        (NINE.replace(",8,", ",91,"), "line 1 has angle_azimuth '91'; give an integer from -90 to 90"),
+        (NINE.replace(",2,", ",up,"), "line 1 has angle_elevation 'up'; give an integer from -90 to 90"),
+        (NINE.replace(",37,", ",40,"), "line 1 has channel '40'"),
+        (NINE.replace("1437347", "-1"), "line 1 has timestamp_ms '-1'"),
+        (TEN.replace("40871", "x"), "line 1 has sequence number 'x'"),
+        (line("", "a"), "line 1 has instance id ''; give 1 to 128 characters"),
+        (line("t", ""), "line 1 has anchor id ''; give 1 to 128 characters"),
+        ("OK\n+STARTUP\n", r"no line begins with \+UUDF:; give at least one"),
+    ],
+)
+def test_refusals_name_the_line_and_the_remedy(text: str, words: str):
+    with pytest.raises(InvalidReportError, match=words):
+        parse_ublox(text)
+
+
+def test_a_line_of_another_kind_is_refused():
+    with pytest.raises(InvalidReportError, match="the line is 'OK'; give a line that begins with"):
+        parse_uudf("OK")
+
+
+def test_too_many_reports_are_refused():
+    with pytest.raises(InvalidReportError, match="1001 reports; give at most 1000"):
+        parse_ublox("\n".join([line("t", "a")] * 1001))
