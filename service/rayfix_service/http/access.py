@@ -8,6 +8,7 @@ from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from rayfix_service.http.keys import ApiKeys
+from rayfix_service.http.paths import is_open
 from rayfix_service.http.problems import (
     TOO_MANY_REQUESTS,
     UNAUTHORIZED,
@@ -26,8 +27,7 @@ _CLIENT = "rayfix.client"
 class Access:
     """Middleware that asks for an API key and keeps to the rate limit.
 
-    What tells of measurements and positions is under ``/v1`` and needs a key, as do the figures; health checks, the
-    documentation and the viewer's page are open.
+    Health checks, the documentation and the viewer's page are open; all else needs a key, whether it is there or not.
     """
 
     def __init__(self, app: ASGIApp, keys: ApiKeys | None, limit: RateLimit | None) -> None:
@@ -37,7 +37,7 @@ class Access:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
-        if scope["type"] in ("http", "websocket") and _needs_key(scope["path"]):
+        if scope["type"] in ("http", "websocket") and not is_open(scope["path"]):
             try:
                 self._admit(scope)
             except ProblemError as error:
@@ -85,15 +85,11 @@ def describe_access(document: dict[str, Any]) -> None:
     }
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
-            if _needs_key(path):
+            if not is_open(path):
                 operation["security"] = [{"bearer": []}, {"header": []}, {}]
                 refusals = (UNAUTHORIZED, TOO_MANY_REQUESTS) if method == "post" else (UNAUTHORIZED,)
                 for status, refusal in problem_responses(*refusals).items():
                     operation["responses"][str(status)] = refusal
-
-
-def _needs_key(path: str) -> bool:
-    return path.startswith("/v1/") or path == "/metrics"
 
 
 def _presented_key(scope: Scope) -> str:

@@ -19,6 +19,8 @@ from rayfix_service.adapters.omlox_hub import open_hub
 from rayfix_service.adapters.silabs import SilabsDocument
 from rayfix_service.http import routes_formats, routes_health, routes_positions, routes_stream, routes_table
 from rayfix_service.http.access import Access, describe_access
+from rayfix_service.http.connections import NOTE
+from rayfix_service.http.edge import Edge
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.feed_relay import FeedRelay
@@ -121,7 +123,7 @@ def create_app(
     settings = settings or ServiceSettings()
 
     @asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
         state = app.state
         state.tables = tables = Tables(
             tables_path, state.metrics, runtime_folder=settings.runtime_folder, at_hand=at_hand
@@ -152,7 +154,7 @@ def create_app(
                     if settings.runtime_folder is not None:
                         forget_dead_workers()
                         await _take_turn(tables, settings.runtime_folder / "ready", stopping)
-                    yield
+                    yield {NOTE: state.metrics.connection_closed}
         finally:
             stop()
             for task in keeping:
@@ -190,6 +192,9 @@ def create_app(
             allow_headers=["Authorization", "Content-Type", "X-API-Key", HEADER],
             expose_headers=["Retry-After", HEADER],
         )
+    app.surround(
+        Edge, hosts=settings.hosts, origins=tuple(settings.cors_origins), asks_for_keys=settings.api_keys is not None
+    )
     app.surround(RequestContext, metrics=app.state.metrics)
     app.include_router(routes_positions.router)
     app.include_router(routes_formats.router)

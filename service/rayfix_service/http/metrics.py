@@ -10,6 +10,7 @@ from prometheus_client.multiprocess import MultiProcessCollector, mark_process_d
 
 from rayfix_service.adapters.omlox_hub import HubOutcome
 from rayfix_service.fusion.report import Fix, Status
+from rayfix_service.http.connections import CLOSED, Closed
 from rayfix_service.tracking.tracker import TrackState
 from rayfix_tables.table import Table
 
@@ -63,6 +64,13 @@ class Metrics:
             registry=self._registry,
         )
         self._told = {outcome: told.labels(outcome) for outcome in get_args(HubOutcome)}
+        closed = Counter(
+            "rayfix_connections_closed",
+            "Connections that the service closed by itself, by the reason",
+            ("reason",),
+            registry=self._registry,
+        )
+        self._closed = {reason: closed.labels(reason) for reason in CLOSED}
         self._table = Gauge(
             "rayfix_table_info",
             "1 for each table that answers, 0 for those that did",
@@ -109,6 +117,10 @@ class Metrics:
     def hub_told(self, outcome: HubOutcome) -> None:
         """Count a position for the omlox hub."""
         self._told[outcome].inc()
+
+    def connection_closed(self, reason: Closed) -> None:
+        """Count a connection that the service closed by itself."""
+        self._closed[reason].inc()
 
     def table_loaded(self, name: str, table: Table) -> None:
         """Tell that a table answers."""
