@@ -1,6 +1,10 @@
 """Who may use the service, and how much."""
 
+import asyncio
+import logging
 import math
+from collections.abc import Callable, Iterator, MutableMapping
+from contextlib import contextmanager
 from typing import Any
 
 from starlette.datastructures import Headers
@@ -21,7 +25,10 @@ from rayfix_service.http.rates import RateLimit
 KEY_SUBPROTOCOL = "rayfix.key."
 """Beginning of the web-socket subprotocol that carries a key; browsers can set no header there."""
 
+_log = logging.getLogger(__name__)
+
 _CLIENT = "rayfix.client"
+_ENDING_SECONDS = 1.0
 
 
 class Access:
@@ -59,19 +66,71 @@ class Access:
                 )
         scope[_CLIENT] = client
         if self._limit is not None and scope["type"] == "http" and scope["method"] == "POST":
-            if (seconds := self._limit.seconds_to_wait(client)) > 0.0:
-                raise ProblemError(
-                    TOO_MANY_REQUESTS,
-                    "this key has sent more reports than it may; try again after the seconds of Retry-After",
-                    headers={"Retry-After": str(math.ceil(seconds))},
-                )
+            _require_tokens(self._limit.seconds_to_wait(client))
             self._limit.charge(client)
+
+
+def charge_reports(connection: HTTPConnection, reports: int) -> None:
+    """Charge the reports of a request that is read now, of which one was charged when its head came.
+
+    Whoever sends many heads first and their bodies later would get all of them in: so the request, as if it came now,
+    must find a token, and only one at a time makes debts.
+
+    Raises
+    ------
+    ProblemError
+        When the client has sent more than it may since the head came.
+    """
+    limit: RateLimit | None = connection.app.state.rate_limit
+    if limit is None or reports <= 1:
+        return
+    client = client_of(connection)
+    _require_tokens(limit.seconds_to_wait(client, given=1))
+    limit.charge(client, reports - 1)
+
+
+def _require_tokens(seconds: float) -> None:
+    if seconds > 0.0:
+        raise ProblemError(
+            TOO_MANY_REQUESTS,
+            "this key has sent more reports than it may; try again after the seconds of Retry-After",
+            headers={"Retry-After": str(math.ceil(seconds))},
+        )
 
 
 def client_of(connection: HTTPConnection) -> str:
     """Return the name of the key that a request came with."""
     name: str = connection.scope[_CLIENT]
     return name
+
+
+@contextmanager
+def until_revoked(connection: HTTPConnection, end: Callable[[], None]) -> Iterator[None]:
+    """Call ``end`` when the key that a connection came with is taken out, and cancel the task that does not end then.
+
+    Of a client that does not read, what it is sent waits; only to cancel helps.
+    """
+    keys: ApiKeys | None = connection.app.state.keys
+    if keys is None:
+        yield
+        return
+    loop, task, late = asyncio.get_running_loop(), asyncio.current_task(), []
+
+    def cut() -> None:
+        _log.warning("a stream whose key was taken out is cut: its client does not read")
+        if task is not None:
+            task.cancel()
+
+    def end_it() -> None:
+        end()
+        late.append(loop.call_later(_ENDING_SECONDS, cut))
+
+    try:
+        with keys.in_use(_presented_key(connection.scope), end_it):
+            yield
+    finally:
+        for handle in late:
+            handle.cancel()
 
 
 def describe_access(document: dict[str, Any]) -> None:
@@ -92,7 +151,7 @@ def describe_access(document: dict[str, Any]) -> None:
                     operation["responses"][str(status)] = refusal
 
 
-def _presented_key(scope: Scope) -> str:
+def _presented_key(scope: MutableMapping[str, Any]) -> str:
     headers = Headers(scope=scope)
     scheme, _, token = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":

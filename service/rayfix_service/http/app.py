@@ -41,6 +41,8 @@ from rayfix_service.web.documents import SimulationRequest
 from rayfix_service.web.per_table import PerTable
 from rayfix_service.wire import BatchDocument, ReportDocument
 
+_SECOND_LOOK_SECONDS = 0.5
+
 _log = logging.getLogger(__name__)
 
 _DESCRIPTION = """\
@@ -176,9 +178,9 @@ def create_app(
     app.state.settings = settings
     app.state.per_table = PerTable()
     app.state.metrics = Metrics()
-    app.state.feed = FixFeed()
+    app.state.feed = FixFeed(settings.feed_limits)
     app.state.relay = None
-    keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
+    app.state.keys = keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
     app.state.rate_limit = limit = _rate_limit(settings, accounts)
     install_problems(app)
     app.surround(ShortWay, path="/v1/positions", answer=partial(routes_positions.answer_position, app.state))
@@ -214,11 +216,11 @@ def _rate_limit(settings: ServiceSettings, accounts: Accounts | None) -> RateLim
 
 async def _keep_keys(keys: ApiKeys, seconds: float) -> None:
     """Read the keys again from time to time; while their file cannot be used, those that were go on."""
-    failure = ""
+    failure, is_settled = "", True
     while True:
-        await asyncio.sleep(seconds)
+        await asyncio.sleep(seconds if is_settled else min(seconds, _SECOND_LOOK_SECONDS))
         try:
-            await asyncio.to_thread(keys.reread)
+            is_settled = await keys.reread()
         except ServiceError as error:
             if failure != (failure := str(error)):
                 _log.error("keys not read again: %s", error)

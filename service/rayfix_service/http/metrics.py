@@ -1,6 +1,7 @@
 """Figures for Prometheus; docs/operations.md lists them."""
 
 import os
+import re
 from pathlib import Path
 from typing import get_args
 
@@ -16,6 +17,13 @@ from rayfix_tables.table import Table
 
 MULTIPROCESS_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
 """Environment variable of prometheus-client: folder where several processes share their figures."""
+
+_ACCEPTABLE = re.compile(
+    r"[ \t]*[a-z*]+/[a-z*.+-]+"
+    r"(?:[ \t]*;[ \t]*(?:version=\d{1,4}(?:\.\d{1,4}){0,2}|(?:escaping|charset|q)=[a-z0-9.-]+))*[ \t]*",
+    re.ASCII | re.IGNORECASE,
+)
+"""An item of an Accept header that prometheus-client can read; it fails at others."""
 
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 _SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -151,7 +159,7 @@ class Metrics:
         if MULTIPROCESS_VARIABLE in os.environ:
             registry = CollectorRegistry()
             MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
-        encode, media_type = choose_encoder(accept)
+        encode, media_type = choose_encoder(",".join(filter(_ACCEPTABLE.fullmatch, accept.split(","))))
         return encode(registry), media_type
 
 

@@ -11,7 +11,7 @@ from rayfix_service.adapters.nrppa import parse_nrppa
 from rayfix_service.adapters.nrppa_documents import NrppaDocument
 from rayfix_service.adapters.silabs import SilabsDocument, parse_silabs
 from rayfix_service.adapters.ublox import parse_ublox
-from rayfix_service.http.access import client_of
+from rayfix_service.http.access import charge_reports
 from rayfix_service.http.dependencies import LinesBody, ReportBody, TableDep
 from rayfix_service.http.examples import NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.http.json_answer import JsonAnswer
@@ -86,8 +86,7 @@ async def post_ublox(
     """Take ``+UUDF`` lines of u-blox anchors and join them by tag and sequence number."""
     known, results = known_height(height_m, height_stdev_m), []
     messages = parse_ublox(body, stations=station_map(station))
-    if (limit := request.app.state.rate_limit) is not None:
-        limit.charge(client_of(request), len(messages) - 1)  # one was charged for the request
+    charge_reports(request, len(messages))
     patience = Patience(request)
     for adapted in messages:
         await patience.take_a_breath()
