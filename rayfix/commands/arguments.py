@@ -56,6 +56,16 @@ def coordinate(text: str) -> float:
     return _number(text, float, math.isfinite, "is no coordinate; give a number of metres")
 
 
+def at_least_one(text: str) -> int:
+    """Read a whole number from 1 on."""
+    return _number(text, int, lambda number: 1 <= number < 1 << 31, "is no whole number from 1 on")
+
+
+def positive_seconds(text: str) -> float:
+    """Read a time limit."""
+    return _number(text, float, lambda seconds: 0.0 < seconds < 1e6, "is no time; give seconds, e.g. 10")
+
+
 def web_origin(text: str) -> str:
     """Read the origin of a web page, as browsers send it."""
     parts = urlsplit(text)

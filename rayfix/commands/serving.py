@@ -3,7 +3,15 @@
 import argparse
 from pathlib import Path
 
-from rayfix.commands.arguments import AddCommand, add_hub_argument, hub_settings, report_rate, web_origin
+from rayfix.commands.arguments import (
+    AddCommand,
+    add_hub_argument,
+    at_least_one,
+    hub_settings,
+    positive_seconds,
+    report_rate,
+    web_origin,
+)
 from rayfix.extras import needs_extra
 
 
@@ -40,15 +48,48 @@ def add_commands(add: AddCommand) -> None:
         metavar="ORIGIN",
         help="let pages of this origin, e.g. https://maps.example.com, call from browsers; may be given several times",
     )
+    serve.add_argument(
+        "--allowed-host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a name by which a service without keys may be called besides localhost, e.g. that of a proxy before it; "
+        "may be given several times",
+    )
+    _add_limit_arguments(serve)
 
     api_key = add("api-key", _api_key, "make an API key, print it once, and add its hash to a key file")
     api_key.add_argument("name", metavar="NAME", help="whose it is")
     api_key.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="key file, made if need be")
 
 
+def _add_limit_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the limits on connections; their defaults are those of the service's settings."""
+    limits = command.add_argument_group("limits on connections, for each worker")
+    for name, default, text in (
+        ("connections", 1000, "open connections"),
+        ("head-kib", 32, "longest head of a request, KiB"),
+        ("head-fields", 100, "most header fields of a request"),
+        ("listeners", 100, "listeners of GET /v1/fixes"),
+        ("backlog-kib", 2048, "fixes that wait for one listener, KiB"),
+    ):
+        limits.add_argument(
+            f"--{name}", type=at_least_one, default=default, metavar="N", help=f"{text} (default: {default})"
+        )
+    for name, seconds, text in (
+        ("head-seconds", 10.0, "time for the head of a request"),
+        ("body-seconds", 60.0, "time for the body of a request"),
+        ("idle-seconds", 5.0, "time between two requests of a connection"),
+        ("unread-seconds", 30.0, "time that a client may leave an answer unread"),
+    ):
+        limits.add_argument(
+            f"--{name}", type=positive_seconds, default=seconds, metavar="S", help=f"{text} (default: {seconds:g})"
+        )
+
+
 def _serve(options: argparse.Namespace) -> int:
     with needs_extra("service"):
-        from rayfix_service.http.settings import ServiceSettings
+        from rayfix_service.http.settings import ConnectionLimits, FeedLimits, ServiceSettings
         from rayfix_service.server.server import is_loopback, serve
     serve(
         options.tables,
@@ -61,6 +102,17 @@ def _serve(options: argparse.Namespace) -> int:
             api_keys=options.api_keys,
             reports_per_second=options.rate_limit,
             cors_origins=tuple(options.cors_origin),
+            hosts=tuple(options.allowed_host),
+            connection_limits=ConnectionLimits(
+                connections=options.connections,
+                head_bytes=options.head_kib << 10,
+                head_fields=options.head_fields,
+                head_seconds=options.head_seconds,
+                body_seconds=options.body_seconds,
+                idle_seconds=options.idle_seconds,
+                unread_seconds=options.unread_seconds,
+            ),
+            feed_limits=FeedLimits(listeners=options.listeners, backlog_bytes=options.backlog_kib << 10),
             track=options.track,
             hub=hub_settings(options),
             simulation=options.allow_simulation or is_loopback(options.host),

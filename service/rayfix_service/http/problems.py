@@ -39,6 +39,7 @@ METHOD_NOT_ALLOWED = ProblemKind(status=405, title="Method not allowed", name="m
 TABLE_REFUSED = ProblemKind(status=409, title="Table refused", name="table-refused")
 BODY_TOO_LARGE = ProblemKind(status=413, title="Body too large", name="body-too-large")
 UNSUPPORTED_MEDIA_TYPE = ProblemKind(status=415, title="Unsupported media type", name="unsupported-media-type")
+MISDIRECTED = ProblemKind(status=421, title="Misdirected request", name="misdirected-request")
 INVALID_REPORT = ProblemKind(status=422, title="Report cannot be used", name="invalid-report")
 INVALID_PARAMETER = ProblemKind(status=422, title="Parameter cannot be used", name="invalid-parameter")
 TOO_MANY_REQUESTS = ProblemKind(status=429, title="Too many requests", name="too-many-requests")
@@ -56,6 +57,7 @@ KINDS = (
     TABLE_REFUSED,
     BODY_TOO_LARGE,
     UNSUPPORTED_MEDIA_TYPE,
+    MISDIRECTED,
     INVALID_REPORT,
     INVALID_PARAMETER,
     TOO_MANY_REQUESTS,

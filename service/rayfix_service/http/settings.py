@@ -15,12 +15,58 @@ class BodyLimits:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ConnectionLimits:
+    """What a connection may cost, whoever opened it.
+
+    Attributes
+    ----------
+    connections : int
+        Open connections of a worker, web sockets among them. With more, the one that has waited longest for a request
+        is closed; where none waits, only ``/livez`` answers. Fewer where the process may not open that many files.
+    head_bytes, head_fields : int
+        Longest head of a request, request line and header fields, and most fields.
+    head_seconds, body_seconds : float
+        Time for a head, from the first byte or the begin of the connection, and for the body after it.
+    idle_seconds : float
+        Time between two requests.
+    unread_seconds : float
+        Time that a client may leave an answer unread, all buffers being full.
+    """
+
+    connections: int = 1000
+    head_bytes: int = 32 << 10
+    head_fields: int = 100
+    head_seconds: float = 10.0
+    body_seconds: float = 60.0
+    idle_seconds: float = 5.0
+    unread_seconds: float = 30.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeedLimits:
+    """What the listeners of the feed of fixes may cost a worker.
+
+    Attributes
+    ----------
+    listeners : int
+        At a time; more are refused.
+    backlog_bytes : int
+        Fixes that wait for one listener; the oldest are dropped beyond it.
+    """
+
+    listeners: int = 100
+    backlog_bytes: int = 2 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
 class ServiceSettings:
     """Settings of one application.
 
     Attributes
     ----------
     body_limits : BodyLimits
+    connection_limits : ConnectionLimits
+    feed_limits : FeedLimits
     api_keys : pathlib.Path, optional
         File of the API keys; without it, none is asked for.
     reports_per_second : float, optional
@@ -28,6 +74,8 @@ class ServiceSettings:
     burst_seconds : float
     cors_origins : tuple of str
         Origins such as ``https://maps.example.com`` whose pages may call the service from a browser.
+    hosts : tuple of str
+        Names by which a service without keys may be called, besides loopback addresses; empty where any will do.
     fix_seconds : float
         Time limit of a slow fix.
     slow_fix_threads, slow_fixes_waiting : int
@@ -48,10 +96,13 @@ class ServiceSettings:
     """
 
     body_limits: BodyLimits = field(default_factory=BodyLimits)
+    connection_limits: ConnectionLimits = field(default_factory=ConnectionLimits)
+    feed_limits: FeedLimits = field(default_factory=FeedLimits)
     api_keys: Path | None = None
     reports_per_second: float | None = None
     burst_seconds: float = 2.0
     cors_origins: tuple[str, ...] = ()
+    hosts: tuple[str, ...] = ()
     fix_seconds: float = 10.0
     slow_fix_threads: int = 2
     slow_fixes_waiting: int = 32

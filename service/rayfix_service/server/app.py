@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from rayfix_service.adapters.nrppa_documents import NrppaDocument
 from rayfix_service.adapters.omlox_hub import open_hub
 from rayfix_service.adapters.silabs import SilabsDocument
+from rayfix_service.http.access.edge import Edge
 from rayfix_service.http.access.guard import Access, describe_access
 from rayfix_service.http.access.keys import ApiKeys
 from rayfix_service.http.access.rates import Accounts, RateLimit
@@ -30,6 +31,7 @@ from rayfix_service.http.problems import Problem, install_problems
 from rayfix_service.http.routes import formats, health, positions, stream, table
 from rayfix_service.http.routes.stream import FixEventDocument
 from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.http.telemetry.connections import NOTE
 from rayfix_service.http.telemetry.metrics import Metrics, forget_dead_workers
 from rayfix_service.http.telemetry.request_context import HEADER, RequestContext
 from rayfix_service.server.fast_path import ShortWay
@@ -38,6 +40,8 @@ from rayfix_service.web import routes_assets, routes_scene, routes_simulation
 from rayfix_service.web.documents import SimulationRequest
 from rayfix_service.web.table_cache import PerTable
 from rayfix_service.wire import BatchDocument, ReportDocument
+
+_SECOND_LOOK_SECONDS = 0.5
 
 _log = logging.getLogger(__name__)
 
@@ -121,7 +125,7 @@ def create_app(
     settings = settings or ServiceSettings()
 
     @asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
         state = app.state
         state.tables = tables = Tables(
             tables_path, state.metrics, runtime_folder=settings.runtime_folder, at_hand=at_hand
@@ -152,7 +156,7 @@ def create_app(
                     if settings.runtime_folder is not None:
                         forget_dead_workers()
                         await _take_turn(tables, settings.runtime_folder / "ready", stopping)
-                    yield
+                    yield {NOTE: state.metrics.connection_closed}
         finally:
             stop()
             for task in keeping:
@@ -174,9 +178,9 @@ def create_app(
     app.state.settings = settings
     app.state.per_table = PerTable()
     app.state.metrics = Metrics()
-    app.state.feed = FixFeed()
+    app.state.feed = FixFeed(settings.feed_limits)
     app.state.relay = None
-    keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
+    app.state.keys = keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
     app.state.rate_limit = limit = _rate_limit(settings, accounts)
     install_problems(app)
     app.surround(ShortWay, path="/v1/positions", answer=partial(positions.answer_position, app.state))
@@ -190,6 +194,9 @@ def create_app(
             allow_headers=["Authorization", "Content-Type", "X-API-Key", HEADER],
             expose_headers=["Retry-After", HEADER],
         )
+    app.surround(
+        Edge, hosts=settings.hosts, origins=tuple(settings.cors_origins), asks_for_keys=settings.api_keys is not None
+    )
     app.surround(RequestContext, metrics=app.state.metrics)
     app.include_router(positions.router)
     app.include_router(formats.router)
@@ -209,11 +216,11 @@ def _rate_limit(settings: ServiceSettings, accounts: Accounts | None) -> RateLim
 
 async def _keep_keys(keys: ApiKeys, seconds: float) -> None:
     """Read the keys again from time to time; while their file cannot be used, those that were go on."""
-    failure = ""
+    failure, is_settled = "", True
     while True:
-        await asyncio.sleep(seconds)
+        await asyncio.sleep(seconds if is_settled else min(seconds, _SECOND_LOOK_SECONDS))
         try:
-            await asyncio.to_thread(keys.reread)
+            is_settled = await keys.reread()
         except ServiceError as error:
             if failure != (failure := str(error)):
                 _log.error("keys not read again: %s", error)

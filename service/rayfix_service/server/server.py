@@ -5,6 +5,7 @@ import gc
 import ipaddress
 import logging
 import os
+import resource
 import socket
 import sys
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import NamedTemporaryFile, TemporaryDirectory
+from typing import cast
 
 import uvicorn
 
@@ -20,22 +22,29 @@ from rayfix_service.http.access.keys import read_key_file
 from rayfix_service.http.access.rates import Accounts
 from rayfix_service.http.answering.served_tables import forget_changed, load_tables
 from rayfix_service.http.errors import ServiceError
-from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.http.settings import ConnectionLimits, ServiceSettings
+from rayfix_service.http.telemetry.connections import Crowd
 from rayfix_service.http.telemetry.logs import LogFormat, log_config
 from rayfix_service.http.telemetry.metrics import MULTIPROCESS_VARIABLE, share_figures
 from rayfix_service.server.app import create_app
-from rayfix_service.server.protocol import GatheringProtocol
+from rayfix_service.server.protocol import GatheringProtocol, SocketProtocol
 from rayfix_service.server.workers import COULD_NOT_START, run_workers
 from rayfix_tables.errors import RayfixError
 
-_MAX_MESSAGE = 16 << 20  # bytes; up to here a message that is too long is answered, beyond it ends the connection
+_MESSAGES = 2  # times as long as a report may be, a message is answered that it is too long; then the connection ends
 _FIGURES_BYTES = 8 << 20  # of some workers
+_OTHER_FILES = 150  # that a worker may have open besides its connections: tables, libraries, pipes, a few spare ones
 _SHUTDOWN_SECONDS = 10  # for requests under way; a full batch takes about one
 _ARRIVING_SECONDS = 0.2  # for requests that are on the way to this process when it is told to end
 
 _TRACKS = (
     "each of the %d workers follows targets by itself, and the system chooses who answers a connection: a target's "
     "reports belong on one connection; else serve with one worker on each of several ports, balanced by target_id"
+)
+
+_FEW_FILES = (
+    "a worker takes %d connections instead of %d, as it may not open more files; raise its limit (ulimit -n) "
+    "or give fewer --connections"
 )
 
 _log = logging.getLogger(__name__)
@@ -88,6 +97,8 @@ def serve(
             f"host {host} can be reached from other machines, so that API keys are needed; make one with "
             "'rayfix api-key NAME -o FILE' and give --api-keys FILE, or listen on 127.0.0.1"
         )
+    else:
+        settings = replace(settings, hosts=(*settings.hosts, host))
     check_address(host, port)
     with ExitStack() as stack:
         if workers > 1:
@@ -95,19 +106,24 @@ def serve(
         if MULTIPROCESS_VARIABLE in os.environ:
             _check_room(Path(os.environ[MULTIPROCESS_VARIABLE]))
         at_hand = load_tables(path)
+        limits = fitting(settings.connection_limits)
         config = uvicorn.Config(
             partial(create_app, path, settings, at_hand=at_hand, accounts=Accounts()),
             factory=True,
             host=host,
             port=port,
-            http=GatheringProtocol,
-            ws_max_size=_MAX_MESSAGE,
+            http=cast("type[asyncio.Protocol]", partial(GatheringProtocol, crowd=Crowd(limits))),
+            ws=SocketProtocol,
+            ws_max_size=_MESSAGES * settings.body_limits.report,
+            timeout_keep_alive=cast("int", limits.idle_seconds),
             ws_per_message_deflate=False,  # costs more than it saves, on messages of a kilobyte
             timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
             server_header=False,
             access_log=False,  # this package has one of its own
             log_config=log_config(log_format, access_log=access_log),
         )
+        if limits != settings.connection_limits:
+            _log.warning(_FEW_FILES, limits.connections, settings.connection_limits.connections)
         if workers == 1:
             with suppress(KeyboardInterrupt):
                 _run(config)
@@ -123,6 +139,22 @@ def serve(
                 meanwhile=partial(forget_changed, at_hand),
                 ending=bound.close,  # or the system would take connections that nobody answers
             )
+
+
+def fitting(limits: ConnectionLimits) -> ConnectionLimits:
+    """Let this process open as many files as its connections need, and return the limits that it then can keep.
+
+    Where the system's limit is reached, nothing answers: connections that cannot be taken wait.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = limits.connections + _OTHER_FILES
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return limits
+    allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+    with suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+        soft = allowed
+    return limits if soft >= needed else replace(limits, connections=max(soft - _OTHER_FILES, 1))
 
 
 def _work(config: uvicorn.Config, bound: socket.socket) -> None:

@@ -32,6 +32,9 @@ class _Recorder(asyncio.Transport):
     def is_closing(self) -> bool:
         return self.closing
 
+    def get_write_buffer_size(self) -> int:
+        return 0
+
 
 def calls_of(*turns: Callable[[GatheringTransport], None]) -> list[tuple[str, bytes]]:
     """Return what the connection is asked to do, with an empty entry at the end of each of some turns of the loop."""

@@ -59,7 +59,7 @@ def test_a_real_server_answers_and_ends(hall_table_path: Path):
             ("/v1/positions", 99, "{"),
             ("/v1/positions/batch", len(batch), batch),
         ]:
-            head = [f"POST {path} HTTP/1.1", "Host: x", "Content-Type: application/json"]
+            head = [f"POST {path} HTTP/1.1", "Host: localhost", "Content-Type: application/json"]
             with socket.create_connection(("127.0.0.1", server.port)) as connection:
                 connection.sendall("\r\n".join([*head, f"Content-Length: {length}", "", body]).encode())
                 time.sleep(0.2)
@@ -74,7 +74,12 @@ def test_a_real_server_answers_and_ends(hall_table_path: Path):
 
 def _posted_report(identifier: str) -> bytes:
     body = json.dumps(REPORT)
-    head = ["POST /v1/positions HTTP/1.1", "Host: x", "Content-Type: application/json", f"X-Request-ID: {identifier}"]
+    head = [
+        "POST /v1/positions HTTP/1.1",
+        "Host: localhost",
+        "Content-Type: application/json",
+        f"X-Request-ID: {identifier}",
+    ]
     return "\r\n".join([*head, f"Content-Length: {len(body)}", "", body]).encode()
 
 

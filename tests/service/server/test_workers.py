@@ -164,7 +164,8 @@ def test_a_table_is_verified_once_for_all_workers_and_again_when_it_changes(hall
 @pytest.mark.parametrize("workers", [1, 2])
 def test_what_was_sent_before_the_end_is_answered(hall_table_path: Path, workers: int):
     body = json.dumps(REPORT).encode()
-    head = f"POST /v1/positions HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
+    head = "POST /v1/positions HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+    head += f"Content-Length: {len(body)}"
     with start_server(hall_table_path, workers=workers) as server, ExitStack() as stack:
         address = ("127.0.0.1", server.port)
         server.wait_for("startup complete", workers)

@@ -1,6 +1,10 @@
 """Who may use the service, and how much."""
 
+import asyncio
+import logging
 import math
+from collections.abc import Callable, Iterator, MutableMapping
+from contextlib import contextmanager
 from typing import Any
 
 from starlette.datastructures import Headers
@@ -8,6 +12,7 @@ from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from rayfix_service.http.access.keys import ApiKeys
+from rayfix_service.http.access.paths import is_open
 from rayfix_service.http.access.rates import RateLimit
 from rayfix_service.http.problems import (
     TOO_MANY_REQUESTS,
@@ -20,14 +25,16 @@ from rayfix_service.http.problems import (
 KEY_SUBPROTOCOL = "rayfix.key."
 """Beginning of the web-socket subprotocol that carries a key; browsers can set no header there."""
 
+_log = logging.getLogger(__name__)
+
 _CLIENT = "rayfix.client"
+_ENDING_SECONDS = 1.0
 
 
 class Access:
     """Middleware that asks for an API key and keeps to the rate limit.
 
-    What tells of measurements and positions is under ``/v1`` and needs a key, as do the figures; health checks, the
-    documentation and the viewer's page are open.
+    Health checks, the documentation and the viewer's page are open; all else needs a key, whether it is there or not.
     """
 
     def __init__(self, app: ASGIApp, keys: ApiKeys | None, limit: RateLimit | None) -> None:
@@ -37,7 +44,7 @@ class Access:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
-        if scope["type"] in ("http", "websocket") and _needs_key(scope["path"]):
+        if scope["type"] in ("http", "websocket") and not is_open(scope["path"]):
             try:
                 self._admit(scope)
             except ProblemError as error:
@@ -59,19 +66,71 @@ class Access:
                 )
         scope[_CLIENT] = client
         if self._limit is not None and scope["type"] == "http" and scope["method"] == "POST":
-            if (seconds := self._limit.seconds_to_wait(client)) > 0.0:
-                raise ProblemError(
-                    TOO_MANY_REQUESTS,
-                    "this key has sent more reports than it may; try again after the seconds of Retry-After",
-                    headers={"Retry-After": str(math.ceil(seconds))},
-                )
+            _require_tokens(self._limit.seconds_to_wait(client))
             self._limit.charge(client)
+
+
+def charge_reports(connection: HTTPConnection, reports: int) -> None:
+    """Charge the reports of a request that is read now, of which one was charged when its head came.
+
+    Whoever sends many heads first and their bodies later would get all of them in: so the request, as if it came now,
+    must find a token, and only one at a time makes debts.
+
+    Raises
+    ------
+    ProblemError
+        When the client has sent more than it may since the head came.
+    """
+    limit: RateLimit | None = connection.app.state.rate_limit
+    if limit is None or reports <= 1:
+        return
+    client = client_of(connection)
+    _require_tokens(limit.seconds_to_wait(client, given=1))
+    limit.charge(client, reports - 1)
+
+
+def _require_tokens(seconds: float) -> None:
+    if seconds > 0.0:
+        raise ProblemError(
+            TOO_MANY_REQUESTS,
+            "this key has sent more reports than it may; try again after the seconds of Retry-After",
+            headers={"Retry-After": str(math.ceil(seconds))},
+        )
 
 
 def client_of(connection: HTTPConnection) -> str:
     """Return the name of the key that a request came with."""
     name: str = connection.scope[_CLIENT]
     return name
+
+
+@contextmanager
+def until_revoked(connection: HTTPConnection, end: Callable[[], None]) -> Iterator[None]:
+    """Call ``end`` when the key that a connection came with is taken out, and cancel the task that does not end then.
+
+    Of a client that does not read, what it is sent waits; only to cancel helps.
+    """
+    keys: ApiKeys | None = connection.app.state.keys
+    if keys is None:
+        yield
+        return
+    loop, task, late = asyncio.get_running_loop(), asyncio.current_task(), []
+
+    def cut() -> None:
+        _log.warning("a stream whose key was taken out is cut: its client does not read")
+        if task is not None:
+            task.cancel()
+
+    def end_it() -> None:
+        end()
+        late.append(loop.call_later(_ENDING_SECONDS, cut))
+
+    try:
+        with keys.in_use(_presented_key(connection.scope), end_it):
+            yield
+    finally:
+        for handle in late:
+            handle.cancel()
 
 
 def describe_access(document: dict[str, Any]) -> None:
@@ -85,18 +144,14 @@ def describe_access(document: dict[str, Any]) -> None:
     }
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
-            if _needs_key(path):
+            if not is_open(path):
                 operation["security"] = [{"bearer": []}, {"header": []}, {}]
                 refusals = (UNAUTHORIZED, TOO_MANY_REQUESTS) if method == "post" else (UNAUTHORIZED,)
                 for status, refusal in problem_responses(*refusals).items():
                     operation["responses"][str(status)] = refusal
 
 
-def _needs_key(path: str) -> bool:
-    return path.startswith("/v1/") or path == "/metrics"
-
-
-def _presented_key(scope: Scope) -> str:
+def _presented_key(scope: MutableMapping[str, Any]) -> str:
     headers = Headers(scope=scope)
     scheme, _, token = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":

@@ -5,20 +5,26 @@ lines and those that begin with ``#`` are left out. Keys are 256 random bits, so
 what makes password hashes slow is for secrets that people choose.
 """
 
+import asyncio
 import hashlib
 import hmac
+import logging
 import os
 import re
 import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rayfix_service.http.errors import ServiceError
+
+_log = logging.getLogger(__name__)
 
 _LINE = re.compile(r"([A-Za-z0-9._-]{1,64}):([0-9a-f]{64})")
 
 
 class ApiKeys:
-    """The keys that a service takes.
+    """The keys that a service takes. Of one event loop.
 
     Parameters
     ----------
@@ -28,12 +34,14 @@ class ApiKeys:
     Raises
     ------
     ServiceError
-        When it cannot be read or has no key.
+        When it cannot be read, or a line is wrong.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._hashes = read_key_file(path)
+        self._hashes = _read_hashes(path)
+        self._found_none = False
+        self._using: dict[object, tuple[str, Callable[[], None]]] = {}
 
     def name_of(self, key: str) -> str | None:
         """Return the name of a key, None for one that is unknown.
@@ -47,15 +55,52 @@ class ApiKeys:
                 found = name
         return found
 
-    def reread(self) -> None:
-        """Read the file again; a mounted secret may have changed.
+    @contextmanager
+    def in_use(self, key: str, end: Callable[[], None]) -> Iterator[None]:
+        """Call ``end`` when a key, which something that stays open was admitted with, is no longer taken."""
+        digest, use = _digest(key), object()
+        self._using[use] = (digest, end)
+        try:
+            if digest not in self._hashes.values():  # taken out between the two
+                end()
+            yield
+        finally:
+            self._using.pop(use, None)
+
+    async def reread(self) -> bool:
+        """Read the file again; a mounted secret may have changed. Tell whether the keys are those of the file.
+
+        Without a key in it, or without the file, there are none: that counts once two looks in a row found it so, as
+        someone may be about to write it anew.
 
         Raises
         ------
         ServiceError
             When it cannot be used; the keys stay as they are.
         """
-        self._hashes = read_key_file(self._path)
+        hashes = await asyncio.to_thread(self._read)
+        if not hashes and self._hashes and not self._found_none:
+            self._found_none = True
+            return False
+        self._found_none = False
+        if hashes == self._hashes:
+            return True
+        if not hashes:
+            _log.warning("there is no key in %s any more: nobody is let in", self._path)
+        self._hashes = hashes
+        for digest, end in list(self._using.values()):
+            if digest not in hashes.values():
+                end()
+        return True
+
+    def _read(self) -> dict[str, str]:
+        try:
+            self._path.stat()
+        except FileNotFoundError:
+            return {}
+        except OSError:
+            pass  # what reads it says why
+        return _read_hashes(self._path)
 
 
 def read_key_file(path: Path) -> dict[str, str]:

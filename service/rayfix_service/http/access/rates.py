@@ -73,11 +73,14 @@ class RateLimit:
         self._clock = clock
         self._accounts = accounts or Accounts()
 
-    def seconds_to_wait(self, client: str) -> float:
-        """Return how long a client has to wait for its next report, 0 if it need not."""
+    def seconds_to_wait(self, client: str, *, given: int = 0) -> float:
+        """Return how long a client has to wait for its next report, 0 if it need not.
+
+        ``given`` tokens are taken as if they were not charged.
+        """
         now = self._clock()
         # A bucket with one token is this long from being full.
-        longest = (self._burst - 1.0) / self._per_second
+        longest = (self._burst - 1.0 + given) / self._per_second
         return max(0.0, self._accounts.full_at(client, now) - now - longest)
 
     def charge(self, client: str, reports: int = 1) -> None:

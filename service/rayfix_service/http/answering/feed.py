@@ -6,6 +6,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from rayfix_service.http.settings import FeedLimits
+
+_RELAY_BYTES = 32 << 20
+"""Fixes that wait for another worker, which hears for all of its listeners."""
+
 QUEUE_LENGTH = 256
 """Fixes that wait for a listener; of one that reads more slowly, the oldest are dropped."""
 
@@ -41,13 +46,24 @@ class Subscription:
         The only table and the only target to hear of.
     own : bool
         Whether to hear only of what this process located.
+    backlog_bytes : int
+        Beyond which the oldest of several waiting events are dropped.
     """
 
-    def __init__(self, *, table: str | None = None, target_id: str | None = None, own: bool = False) -> None:
+    def __init__(
+        self,
+        *,
+        table: str | None = None,
+        target_id: str | None = None,
+        own: bool = False,
+        backlog_bytes: int = FeedLimits.backlog_bytes,
+    ) -> None:
         self.own = own
+        self._most = backlog_bytes
+        self._length = 0
         self._table = table
         self._target_id = target_id
-        self._events: deque[FixEvent] = deque(maxlen=QUEUE_LENGTH)
+        self._events: deque[FixEvent] = deque()
         self._wake = asyncio.Event()
         self._dropped = 0
         self.closed = False
@@ -56,8 +72,11 @@ class Subscription:
         """Queue an event, if it is of the table and the target."""
         if self._table not in (None, event.table) or self._target_id not in (None, event.target_id):
             return
-        self._dropped += len(self._events) == QUEUE_LENGTH
         self._events.append(event)
+        self._length += len(event.data)
+        while len(self._events) > QUEUE_LENGTH or (self._length > self._most and len(self._events) > 1):
+            self._length -= len(self._events.popleft().data)
+            self._dropped += 1
         self._wake.set()
 
     def close(self) -> None:
@@ -76,7 +95,7 @@ class Subscription:
     def take(self) -> tuple[int, list[FixEvent]]:
         """Take how many events were dropped since the last time, and those that are left."""
         dropped, events = self._dropped, list(self._events)
-        self._dropped = 0
+        self._dropped = self._length = 0
         self._events.clear()
         if not self.closed:
             self._wake.clear()
@@ -84,9 +103,15 @@ class Subscription:
 
 
 class FixFeed:
-    """Hands the fixes of one process to its listeners. Of one event loop."""
+    """Hands the fixes of one process to its listeners. Of one event loop.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    limits : FeedLimits, optional
+    """
+
+    def __init__(self, limits: FeedLimits | None = None) -> None:
+        self._limits = limits or FeedLimits()
         self._subscriptions: set[Subscription] = set()
         self._count = 0
         self._closed = False
@@ -96,12 +121,18 @@ class FixFeed:
         """How many listen to the fixes of all processes."""
         return sum(not subscription.own for subscription in self._subscriptions)
 
+    @property
+    def is_full(self) -> bool:
+        """Whether there may be no more listeners."""
+        return self.num_listeners >= self._limits.listeners
+
     @contextmanager
     def subscribe(
         self, *, table: str | None = None, target_id: str | None = None, own: bool = False
     ) -> Iterator[Subscription]:
         """Listen to all fixes, or to those of one table or target, or of this process."""
-        subscription = Subscription(table=table, target_id=target_id, own=own)
+        most = _RELAY_BYTES if own else self._limits.backlog_bytes
+        subscription = Subscription(table=table, target_id=target_id, own=own, backlog_bytes=most)
         if self._closed:
             subscription.close()
         self._subscriptions.add(subscription)

@@ -11,7 +11,7 @@ from rayfix_service.adapters.nrppa import parse_nrppa
 from rayfix_service.adapters.nrppa_documents import NrppaDocument
 from rayfix_service.adapters.silabs import SilabsDocument, parse_silabs
 from rayfix_service.adapters.ublox import parse_ublox
-from rayfix_service.http.access.guard import client_of
+from rayfix_service.http.access.guard import charge_reports
 from rayfix_service.http.answering.cooperative import Patience
 from rayfix_service.http.answering.locating import AnswererDep, foreign
 from rayfix_service.http.answering.response_options import WantedDep
@@ -86,8 +86,7 @@ async def post_ublox(
     """Take ``+UUDF`` lines of u-blox anchors and join them by tag and sequence number."""
     known, results = known_height(height_m, height_stdev_m), []
     messages = parse_ublox(body, stations=station_map(station))
-    if (limit := request.app.state.rate_limit) is not None:
-        limit.charge(client_of(request), len(messages) - 1)  # one was charged for the request
+    charge_reports(request, len(messages))
     patience = Patience(request)
     for adapted in messages:
         await patience.take_a_breath()

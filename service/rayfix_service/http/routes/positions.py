@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 from starlette.datastructures import State
 from starlette.types import Receive, Scope
 
-from rayfix_service.http.access.guard import client_of
+from rayfix_service.http.access.guard import charge_reports
 from rayfix_service.http.answering.cooperative import Patience
 from rayfix_service.http.answering.locating import Answerer, AnswererDep, native
 from rayfix_service.http.answering.response_options import WantedDep, wanted_by
@@ -83,8 +83,7 @@ async def post_batch(
 ) -> JsonAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
     documents = _batch_reports(read_json(body))
-    if (limit := request.app.state.rate_limit) is not None:
-        limit.charge(client_of(request), len(documents) - 1)  # one was charged for the request
+    charge_reports(request, len(documents))
     results: list[dict[str, Any]] = []
     patience = Patience(request)
     for document in documents:  # not by locate_batch: other batches keep the other workers, one for each core, as busy

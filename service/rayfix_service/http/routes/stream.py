@@ -2,28 +2,32 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import suppress
 from functools import partial
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request, WebSocket
+from fastapi import APIRouter, Depends, Query, Request, WebSocket
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 from pydantic_core import to_json
-from starlette.websockets import WebSocketDisconnect
+from starlette.websockets import WebSocketDisconnect, WebSocketDisconnected
 
-from rayfix_service.http.access.guard import client_of
+from rayfix_service.http.access.guard import client_of, until_revoked
 from rayfix_service.http.access.rates import RateLimit
-from rayfix_service.http.answering.feed import FixFeed
+from rayfix_service.http.answering.feed import FixEvent, FixFeed
 from rayfix_service.http.answering.feed_relay import FeedRelay
-from rayfix_service.http.answering.locating import AnswererDep, native
-from rayfix_service.http.answering.response_options import WantedDep
+from rayfix_service.http.answering.locating import Answerer, AnswererDep, native
+from rayfix_service.http.answering.response_options import Wanted, WantedDep
+from rayfix_service.http.answering.served_tables import Tables
 from rayfix_service.http.openapi.examples import FIX_EVENT_EXAMPLE
 from rayfix_service.http.problems import (
     BODY_TOO_LARGE,
     INVALID_PARAMETER,
     NOT_FOUND,
     NOT_READY,
+    OVERLOADED,
+    ProblemError,
     problem_document,
     problem_responses,
 )
@@ -36,6 +40,8 @@ HEARTBEAT_SECONDS = 15.0
 """Least frequency of something on a feed, so that proxies keep it open and either side notices when it is not."""
 
 _RETRY_MILLISECONDS = 2000
+_PIECE = 1 << 16  # bytes
+_REVOKED = 1008  # a web socket's code for a breach of policy
 
 
 class FixEventDocument(BaseModel):
@@ -71,6 +77,7 @@ class EventStreamResponse(StreamingResponse):
             },
         },
         **problem_responses(INVALID_PARAMETER, NOT_FOUND, NOT_READY),
+        OVERLOADED.status: {**problem_responses(NOT_READY)[503], "description": "Not ready, or overloaded"},
     },
 )
 async def get_fixes(
@@ -83,18 +90,27 @@ async def get_fixes(
     tables.all()  # none answers before it is ready
     if table is not None:
         tables.named(table)
+    if request.app.state.feed.is_full:
+        raise ProblemError(
+            OVERLOADED,
+            "as many listen to the fixes as may; try again later, or start the service with more --listeners",
+            headers={"Retry-After": "10"},
+        )
     return EventStreamResponse(
-        _events(request.app.state.feed, request.app.state.relay, table, target_id),
+        _events(request, table, target_id),
         # A proxy that gathers answers before it passes them on would gather these for ever.
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
 
 
-async def _events(
-    feed: FixFeed, relay: FeedRelay | None, table: str | None, target_id: str | None
-) -> AsyncIterator[bytes]:
-    """Write the events of a feed."""
-    with feed.subscribe(table=table, target_id=target_id) as subscription:
+async def _events(request: Request, table: str | None, target_id: str | None) -> AsyncIterator[bytes]:
+    """Write the events of a feed, in pieces after which the client may have to read first."""
+    feed: FixFeed = request.app.state.feed
+    relay: FeedRelay | None = request.app.state.relay
+    with (
+        feed.subscribe(table=table, target_id=target_id) as subscription,
+        until_revoked(request, subscription.close),
+    ):
         if relay is not None:
             await relay.connect()
         yield b"retry: %d\n\n" % _RETRY_MILLISECONDS
@@ -103,42 +119,89 @@ async def _events(
             dropped, events = subscription.take()
             if dropped:
                 yield b'event: dropped\ndata: {"dropped":%d}\n\n' % dropped
-            if events:
-                yield b"".join(b"id: %d\nevent: fix\ndata: %b\n\n" % (e.number, e.data) for e in events)
-            elif subscription.closed:
+            for piece in _pieces(events):
+                yield piece
+            if subscription.closed:
                 return
-            else:
+            if not events:
                 yield b": still here\n\n"
 
 
+def _pieces(events: list[FixEvent]) -> Iterator[bytes]:
+    """Write events, several in a piece where they are short; a long one is several pieces."""
+    gathered = b""
+    for event in events:
+        gathered += b"id: %d\nevent: fix\ndata: " % event.number
+        for start in range(0, len(event.data), _PIECE):
+            gathered += event.data[start : start + _PIECE]
+            if len(gathered) >= _PIECE:
+                yield gathered
+                gathered = b""
+        gathered += b"\n\n"
+    if gathered:
+        yield gathered
+
+
+async def get_table_name(table: TableDep, name: Annotated[str | None, Query(alias="table")] = None) -> str | None:
+    """Check that there is the table that the query names, and return its name alone: a stream outlives tables."""
+    return name
+
+
 @router.websocket("/stream")
-async def stream(websocket: WebSocket, answerer: AnswererDep, table: TableDep, wanted: WantedDep) -> None:
+async def stream(
+    websocket: WebSocket,
+    answerer: AnswererDep,
+    table: Annotated[str | None, Depends(get_table_name)],
+    wanted: WantedDep,
+) -> None:
     """Answer each message, a report, with a fix or a problem, in their order.
 
     The next message is read when the last answer is on its way, so that a client that sends faster than it is
-    answered waits.
+    answered waits. Each is answered from the table that is served then.
     """
     await websocket.accept(subprotocol="rayfix" if "rayfix" in websocket.scope["subprotocols"] else None)
     limit = report_limit(websocket)
     rate: RateLimit | None = websocket.app.state.rate_limit
     client = client_of(websocket)
+    closing: set[asyncio.Task[None]] = set()
+
+    def close() -> None:
+        closing.add(asyncio.create_task(_close(websocket)))
+
+    with until_revoked(websocket, close):
+        try:
+            while True:
+                if rate is not None:
+                    while (seconds := rate.seconds_to_wait(client)) > 0.0:  # another stream may have been faster
+                        await asyncio.sleep(seconds)
+                    rate.charge(client)
+                body = await _next_message(websocket)
+                answer: dict[str, Any]
+                if len(body) > limit:
+                    answer = problem_document(
+                        BODY_TOO_LARGE, f"the message is longer than {limit} bytes; send fewer measurements at once"
+                    )
+                else:
+                    answer = await _answer(websocket.app.state.tables, table, answerer, body, wanted)
+                await websocket.send_text(to_json(answer, inf_nan_mode="null").decode())
+                await asyncio.sleep(0)  # whatever else is on the loop comes in between
+        except (WebSocketDisconnect, WebSocketDisconnected):
+            pass
+
+
+async def _close(websocket: WebSocket) -> None:
+    """Close a stream whose key was taken out."""
+    with suppress(WebSocketDisconnect, WebSocketDisconnected):
+        await websocket.close(_REVOKED, "the API key is no longer taken")
+
+
+async def _answer(tables: Tables, table: str | None, answerer: Answerer, body: bytes, wanted: Wanted) -> dict[str, Any]:
+    """Answer a message from the table that is served now."""
     try:
-        while True:
-            if rate is not None:
-                await asyncio.sleep(rate.seconds_to_wait(client))
-                rate.charge(client)
-            body = await _next_message(websocket)
-            answer: dict[str, Any]
-            if len(body) > limit:
-                answer = problem_document(
-                    BODY_TOO_LARGE, f"the message is longer than {limit} bytes; send fewer measurements at once"
-                )
-            else:
-                answer = await answerer.answer_or_problem(table, partial(native, body), wanted)
-            await websocket.send_text(to_json(answer, inf_nan_mode="null").decode())
-            await asyncio.sleep(0)  # whatever else is on the loop comes in between
-    except WebSocketDisconnect:
-        pass
+        served = tables.named(table)
+    except ProblemError as error:
+        return problem_document(error.kind, str(error), error.errors)
+    return await answerer.answer_or_problem(served, partial(native, body), wanted)
 
 
 async def _next_message(websocket: WebSocket) -> bytes:

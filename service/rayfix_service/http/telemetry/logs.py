@@ -1,16 +1,36 @@
-"""Logs as JSON, one object a line."""
+"""Logs, as text or as JSON, one record a line."""
 
 import copy
 import json
 import logging
+import re
 from datetime import UTC, datetime
 from typing import Any, Literal
 
 import uvicorn.config
+from uvicorn.logging import DefaultFormatter
 
 from rayfix_service.http.telemetry.request_context import ACCESS_LOGGER, REQUEST_ID
 
 LogFormat = Literal["text", "json"]
+
+
+# Control characters, among them escape sequences of terminals, and what ends a line or turns its direction.
+_UNFIT = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def on_one_line(text: str) -> str:
+    """Write what is unfit for a line of a log as Python's escapes."""
+    return _UNFIT.sub(lambda match: ascii(match[0])[1:-1], text)
+
+
+class TextFormatter(DefaultFormatter):
+    """Writes a record as uvicorn does, its message on one line whatever a client had it contain."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
+        """Write one record, without the traceback."""
+        record.message = on_one_line(record.message)
+        return super().formatMessage(record)
 
 
 class JsonFormatter(logging.Formatter):
@@ -48,9 +68,13 @@ def log_config(log_format: LogFormat, *, access_log: bool) -> dict[str, Any]:
     """
     config = copy.deepcopy(uvicorn.config.LOGGING_CONFIG)
     if log_format == "json":
-        config["formatters"] = {
-            name: {"()": f"{JsonFormatter.__module__}.{JsonFormatter.__qualname__}"} for name in config["formatters"]
-        }
+        config["formatters"] = {name: {"()": _name_of(JsonFormatter)} for name in config["formatters"]}
+    else:
+        config["formatters"]["default"]["()"] = _name_of(TextFormatter)
     config["loggers"]["rayfix_service"] = {"handlers": ["default"], "level": "INFO", "propagate": False}
     config["loggers"][ACCESS_LOGGER] = {"level": "INFO" if access_log else "WARNING"}
     return config
+
+
+def _name_of(formatter: type[logging.Formatter]) -> str:
+    return f"{formatter.__module__}.{formatter.__qualname__}"

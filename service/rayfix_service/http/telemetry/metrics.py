@@ -1,6 +1,7 @@
 """Figures for Prometheus; docs/operations.md lists them."""
 
 import os
+import re
 from pathlib import Path
 from typing import get_args
 
@@ -10,11 +11,19 @@ from prometheus_client.multiprocess import MultiProcessCollector, mark_process_d
 
 from rayfix_service.adapters.omlox_hub import HubOutcome
 from rayfix_service.fusion.posterior.fix import Fix, Status
+from rayfix_service.http.telemetry.connections import CLOSED, Closed
 from rayfix_service.tracking.track import TrackState
 from rayfix_tables.table import Table
 
 MULTIPROCESS_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
 """Environment variable of prometheus-client: folder where several processes share their figures."""
+
+_ACCEPTABLE = re.compile(
+    r"[ \t]*[a-z*]+/[a-z*.+-]+"
+    r"(?:[ \t]*;[ \t]*(?:version=\d{1,4}(?:\.\d{1,4}){0,2}|(?:escaping|charset|q)=[a-z0-9.-]+))*[ \t]*",
+    re.ASCII | re.IGNORECASE,
+)
+"""An item of an Accept header that prometheus-client can read; it fails at others."""
 
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 _SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -63,6 +72,13 @@ class Metrics:
             registry=self._registry,
         )
         self._told = {outcome: told.labels(outcome) for outcome in get_args(HubOutcome)}
+        closed = Counter(
+            "rayfix_connections_closed",
+            "Connections that the service closed by itself, by the reason",
+            ("reason",),
+            registry=self._registry,
+        )
+        self._closed = {reason: closed.labels(reason) for reason in CLOSED}
         self._table = Gauge(
             "rayfix_table_info",
             "1 for each table that answers, 0 for those that did",
@@ -110,6 +126,10 @@ class Metrics:
         """Count a position for the omlox hub."""
         self._told[outcome].inc()
 
+    def connection_closed(self, reason: Closed) -> None:
+        """Count a connection that the service closed by itself."""
+        self._closed[reason].inc()
+
     def table_loaded(self, name: str, table: Table) -> None:
         """Tell that a table answers."""
         self._table.labels(*_table_labels(name, table)).set(1)
@@ -139,7 +159,7 @@ class Metrics:
         if MULTIPROCESS_VARIABLE in os.environ:
             registry = CollectorRegistry()
             MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
-        encode, media_type = choose_encoder(accept)
+        encode, media_type = choose_encoder(",".join(filter(_ACCEPTABLE.fullmatch, accept.split(","))))
         return encode(registry), media_type
 
 

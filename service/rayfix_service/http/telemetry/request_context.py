@@ -1,16 +1,19 @@
 """What surrounds every request: its identifier, its place in log and figures, and an answer whatever goes wrong."""
 
+import asyncio
 import logging
 import re
 from contextvars import ContextVar
 from itertools import count
 from secrets import token_hex
 from time import perf_counter
+from typing import Any
+from urllib.parse import quote
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rayfix_service.http.headers import header
-from rayfix_service.http.problems import internal_problem, problem_response
+from rayfix_service.http.problems import OVERLOADED, internal_problem, problem_document, problem_response
 from rayfix_service.http.telemetry.metrics import Metrics
 
 HEADER = "X-Request-ID"
@@ -43,7 +46,10 @@ class RequestContext:
         self._prefix = token_hex(10)  # of this process: a random number for each request costs a system call
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
+        """Serve one request, or one handshake of a web socket and what follows."""
+        if scope["type"] == "websocket":
+            await self._serve_socket(scope, receive, send)
+            return
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -63,14 +69,48 @@ class RequestContext:
         start = perf_counter()
         try:
             await self._app(scope, receive, send_noting)
+        except asyncio.CancelledError:  # the process ends, or the client's key was taken out: no defect
+            if not answered:
+                _log.warning("request %s %s cut off", scope["method"], _one_word(scope["path"]))
+            if not status:
+                await problem_response(_cut_off())(scope, receive, send_noting)
         except Exception:
             if status and not answered:
                 raise  # only the server can cut the connection, and it logs
-            _log.exception("request %s %s failed", scope["method"], scope["path"])
+            _log.exception("request %s %s failed", scope["method"], _one_word(scope["path"]))
             if not status:
                 await problem_response(internal_problem())(scope, receive, send_noting)
         finally:
-            self._note(scope, str(status or "none"), perf_counter() - start, identifier)
+            self._note(scope, scope["method"], str(status or "none"), perf_counter() - start, identifier)
+            REQUEST_ID.reset(token)
+
+    async def _serve_socket(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a web socket; its handshake is a GET, answered with 101 or with a refusal."""
+        identifier = self._identifier(scope)
+        start, noted = perf_counter(), False
+
+        def note(status: str) -> None:
+            nonlocal noted
+            if not noted:
+                noted = True
+                self._note(scope, "GET", status, perf_counter() - start, identifier)
+
+        async def send_noting(message: Message) -> None:
+            kind = message["type"]
+            if kind in ("websocket.accept", "websocket.http.response.start"):
+                message["headers"] = [*message.get("headers", ()), (_RAW_HEADER, identifier.encode())]
+                note("101" if kind == "websocket.accept" else str(message["status"]))
+            elif kind == "websocket.close":
+                note("403")  # what the server makes of it before the handshake
+            await send(message)
+
+        token = REQUEST_ID.set(identifier)
+        try:
+            await self._app(scope, receive, send_noting)
+        except asyncio.CancelledError:
+            _log.warning("web socket %s cut off", _one_word(scope["path"]))
+        finally:
+            note("none")
             REQUEST_ID.reset(token)
 
     def _identifier(self, scope: Scope) -> str:
@@ -80,13 +120,22 @@ class RequestContext:
             return given
         return f"{self._prefix}{next(self._numbers):012x}"
 
-    def _note(self, scope: Scope, status: str, seconds: float, identifier: str) -> None:
+    def _note(self, scope: Scope, method: str, status: str, seconds: float, identifier: str) -> None:
         """Count a request, and log it if that is wanted; the status is "none" where the client left before it."""
         # Only the route's template: the path is the client's, and a figure for each would be without end.
         route = getattr(scope.get("route"), "path", "none")
-        self._metrics.request_done(route, scope["method"], status, seconds)
+        self._metrics.request_done(route, method, status, seconds)
         if _access.isEnabledFor(logging.INFO):
-            fields = {"method": scope["method"], "path": scope["path"], "status": status, "seconds": round(seconds, 6)}
+            fields = {"method": method, "path": scope["path"], "status": status, "seconds": round(seconds, 6)}
             line = "%s %s %s in %.1f ms, request %s"
-            arguments = (scope["method"], scope["path"], status, 1e3 * seconds, identifier)
+            arguments = (_one_word(method), _one_word(scope["path"]), status, 1e3 * seconds, identifier)
             _access.info(line, *arguments, extra={"fields": fields})
+
+
+def _one_word(text: str) -> str:
+    """Write a path so that it is one word of a line: what else follows in it cannot be the client's."""
+    return quote(text, safe="/:@!$&'()*+,;=~", errors="replace")
+
+
+def _cut_off() -> dict[str, Any]:
+    return problem_document(OVERLOADED, "the process ends before this was answered; ask again")
