@@ -134,7 +134,7 @@ async def stream(websocket: WebSocket, answerer: AnswererDep, table: TableDep, w
                     BODY_TOO_LARGE, f"the message is longer than {limit} bytes; send fewer measurements at once"
                 )
             else:
-                answer = await answerer.answer_or_problem(table, partial(native, body), wanted)
+                answer = await answerer.answer_or_problem(table, partial(answerer.read, native, body), wanted)
             await websocket.send_text(to_json(answer, inf_nan_mode="null").decode())
             await asyncio.sleep(0)  # whatever else is on the loop comes in between
     except WebSocketDisconnect:
