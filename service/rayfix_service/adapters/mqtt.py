@@ -245,15 +245,16 @@ class _Session:
     async def read(self, client: aiomqtt.Client) -> None:
         """Take all messages; one that cannot be read costs nothing but itself."""
         async for message in client.messages:
-            if not isinstance(message.payload, bytes):
-                continue
-            try:
-                reports = self.stream.receive(message.topic.value, message.payload, monotonic())
-            except Exception:
-                self.failed["defect"] += 1
-                _log.exception("a message of '%s' failed", in_log(message.topic.value))
-                continue
-            await self._publish(client, reports)
+            if isinstance(message.payload, bytes):
+                await self._publish(client, self._receive(message.topic.value, message.payload))
+
+    def _receive(self, topic: str, payload: bytes) -> list[Adapted]:
+        try:
+            return self.stream.receive(topic, payload, monotonic())
+        except Exception:
+            self.failed["defect"] += 1
+            _log.exception("a message of '%s' failed", in_log(topic))
+            return []
 
     async def watch(self, client: aiomqtt.Client) -> None:
         """End packets that not all locators have heard."""

@@ -33,6 +33,9 @@ from rayfix_tables.site import Station
 
 _RESOLUTION_M = {"m0dot1": 0.1, "mdot1": 0.1, "m1": 1.0, "m10": 10.0, "m30": 30.0}
 
+_TURN = 2.0 * math.pi
+_LARGEST_STDEV_M = 1e6  # that a report takes
+
 _BEYOND = "its value stands for everything beyond the range of the report mapping"
 _NO_AZIMUTH = "a zenith angle without an azimuth cannot be used; report UL-AoA with both"
 _NO_ZENITH = "an azimuth without a zenith angle cannot be turned by beta and gamma; report zenithAoA as well"
@@ -169,9 +172,7 @@ class _Converter:
             return _NO_AZIMUTH
         azimuth = angle_interval(measured.azimuth, zero=math.radians(self.document.azimuth_zero_deg))
         default = math.radians(self.document.angle_stdev_deg)
-        azimuth_stdev = math.sqrt(
-            (_steps(quality.azimuth) * ANGLE_STEP if quality else default) ** 2 + azimuth.variance
-        )
+        azimuth_stdev = _angle_stdev(_steps(quality.azimuth) * ANGLE_STEP if quality else default, azimuth)
         if measured.zenith is None:
             if measured.translation is None:
                 turn = 0.0
@@ -187,7 +188,7 @@ class _Converter:
             )
         zenith = angle_interval(measured.zenith)
         known = quality.zenith if quality else None
-        zenith_stdev = math.sqrt((default if known is None else _steps(known) * ANGLE_STEP) ** 2 + zenith.variance)
+        zenith_stdev = _angle_stdev(default if known is None else _steps(known) * ANGLE_STEP, zenith)
         angle = Angle(
             station_id=self.station_id,
             azimuth=wrap_one(azimuth.middle),
@@ -205,7 +206,7 @@ class _Converter:
         return TimeOfArrival(
             station_id=self.station_id,
             path_length=measured.middle,
-            stdev=math.sqrt(self._time_variance(measured, quality)),
+            stdev=min(math.sqrt(self._time_variance(measured, quality)), _LARGEST_STDEV_M),
         )
 
     def _ranges(self, time: TimeChoice, quality: TimingQuality | None) -> Iterator[Range | str]:
@@ -246,6 +247,11 @@ def _with_sight(measurement: Angle | Range | TimeOfArrival, los: LosInformation 
     return replace(measurement, los_probability=value / 10.0 if name.endswith("Soft") else float(value == "los"))
 
 
+def _angle_stdev(stdev: float, measured: Interval) -> float:
+    """Add the quantisation's variance to a standard deviation; a report takes a full turn at most."""
+    return min(math.sqrt(stdev**2 + measured.variance), _TURN)
+
+
 def _steps(quality: int) -> float:
     """Uncertainty in steps; 0 stands for less than half a step."""
     return max(float(quality), 0.5)
@@ -267,7 +273,7 @@ def _to_global(translation: LcsToGcs, angle: Angle) -> Angle:
         azimuth=turned.azimuth,
         zenith=turned.zenith,
         # Beyond a full turn an azimuth is unknown, which is the case right at the zenith.
-        azimuth_stdev=min(float(stdev[0]), 2.0 * np.pi),
-        zenith_stdev=float(stdev[1]),
+        azimuth_stdev=min(float(stdev[0]), _TURN),
+        zenith_stdev=min(float(stdev[1]), _TURN),
         correlation=float(np.clip(turned.cov[0, 1] / (stdev[0] * stdev[1]), -0.999, 0.999)),
     )
