@@ -11,8 +11,6 @@ from rayfix_tables.errors import ReportError
 MAX_NAME = 256
 """Characters of a target's name."""
 
-_MAX_SHOWN = 100
-
 _NO_TOPIC = re.compile(r"[%/+#\x00-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]|^\$")
 """What means something in an MQTT topic, what a broker may refuse in one, and the sign that escapes them."""
 
@@ -44,9 +42,9 @@ def topic_level(name: str) -> str:
     )
 
 
-def in_log(name: str) -> str:
-    """Write a name within one line of a log or of an error: control characters as escapes, cut when it is long."""
-    text = name if len(name) <= _MAX_SHOWN else f"{name[:_MAX_SHOWN]}..."
+def in_log(name: str, *, most: int = 100) -> str:
+    """Write a name, or a text with names, within one line of a log: control characters as escapes, and not too long."""
+    text = name if len(name) <= most else f"{name[:most]}..."
     return "".join(
         character if character.isprintable() else character.encode("unicode_escape").decode() for character in text
     )

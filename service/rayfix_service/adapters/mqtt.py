@@ -195,7 +195,7 @@ async def _run_session(session: "_Session", broker: Broker, on_ready: Callable[[
             if not connected:
                 text = f"cannot use the MQTT broker {place} ({error}); check its address and your rights"
                 raise BrokerError(text) from error
-            _log.warning("lost the broker %s (%s), trying again in %g s", place, in_log(str(error)), pause)
+            _log.warning("lost the broker %s (%s), trying again in %g s", place, in_log(str(error), most=1000), pause)
         await asyncio.sleep(pause)
         pause = min(2.0 * pause, _LONGEST_PAUSE)
 
@@ -269,7 +269,7 @@ class _Session:
                 document = json.dumps(self._answer(adapted))
             except ReportError as error:
                 self.failed["no position"] += 1
-                _log.info("no position of '%s': %s", target, in_log(str(error)))
+                _log.info("no position of '%s': %s", target, in_log(str(error), most=1000))
                 continue
             except Exception:
                 # A defect that one packet meets must not end the service.

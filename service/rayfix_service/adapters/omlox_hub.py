@@ -153,7 +153,7 @@ class OmloxHub:
             except TimeoutError:
                 reason = f"no answer within {settings.timeout:g} s"
             except httpx.HTTPError as error:
-                reason = in_log(str(error)) or type(error).__name__
+                reason = in_log(str(error), most=1000) or type(error).__name__
             else:
                 if 200 <= status < 300:
                     self._tell_once(failing=False, reason="")

@@ -99,7 +99,7 @@ class SilabsStream:
         try:
             angle = parse_silabs_angle(payload)
         except ReportError as error:
-            self._tell(locator, str(error))
+            self._tell(locator, in_log(str(error), most=1000))
             return []
         moment = datetime.now(UTC)
         return self._reports(self._joiner.add(tag, station_id, angle.sequence, (moment, angle), now))
