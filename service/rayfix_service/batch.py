@@ -80,6 +80,7 @@ def _locate_block(locator: Locator, reports: Sequence[Report | Mapping[str, Any]
         try:
             answers.append(locator.locate(report if isinstance(report, Report) else parse_report(report)))
         except ReportError as error:
+            error.__traceback__ = error.__context__ = None  # they keep the report, and all that was made of it
             answers.append(error)
     return answers
 

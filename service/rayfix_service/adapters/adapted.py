@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from rayfix_service.fusion.measurements.report import Angle, Height, Measurement, Report, TimeOfArrival
 from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportError
 from rayfix_service.wire.documents import HeightDocument
-from rayfix_service.wire.problems import Path, path_text
+from rayfix_service.wire.problems import MAX_PROBLEMS, Path, path_text
 from rayfix_tables.errors import ReportError
 
 
@@ -66,10 +66,10 @@ def adapted_report(
     if not measurements:
         problems = tuple(
             FieldProblem(path=skip.path, message=f"{path_text(skip.path)} is not used: {skip.reason}")
-            for skip in skipped
+            for skip in skipped[:MAX_PROBLEMS]
         )
         empty = FieldProblem(path=(), message="the message has no measurements; give at least one")
-        raise InvalidReportError(problems or (empty,))
+        raise InvalidReportError(problems or (empty,), len(skipped) - len(problems))
     if len(measurements) > MAX_MEASUREMENTS:
         text = f"the message has {len(measurements)} measurements; give at most {MAX_MEASUREMENTS} at once"
         raise InvalidReportError((FieldProblem(path=(), message=text),))

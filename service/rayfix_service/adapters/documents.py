@@ -1,7 +1,7 @@
 """Checking messages of other formats, with errors in the style of :mod:`rayfix_service.wire`."""
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError
@@ -11,9 +11,17 @@ from pydantic_core import ErrorDetails
 from rayfix_service.wire import FieldProblem, InvalidReportError, WireModel, path_text, read_json
 from rayfix_service.wire.documents import HeightDocument
 from rayfix_service.wire.fields import MISFIT, Rfc3339, misfit
-from rayfix_service.wire.problems import Path, shown
+from rayfix_service.wire.limits import has_more_values
+from rayfix_service.wire.problems import Path, invalid_report, shown
 
-_MAX_PROBLEMS = 50
+MAX_STATIONS = 1024
+"""Names that the map of stations of one message may have."""
+
+MAX_MESSAGE_VALUES = 50_000
+"""Values that the JSON text of a message may have, those that are not read counted."""
+
+_SHORT = 64 << 10
+"""Bytes of a message that is validated without a look at how many values it has."""
 
 M = TypeVar("M", bound=WireModel)
 
@@ -53,8 +61,14 @@ KnownHeight = Annotated[
 ]
 
 
-def check(model: type[M], message: Mapping[str, Any] | bytes, *, what: str) -> M:
-    """Validate a message.
+def check(
+    model: type[M],
+    message: Mapping[str, Any] | bytes,
+    *,
+    what: str,
+    check_counts: Callable[[Mapping[str, Any]], None] | None = None,
+) -> M:
+    """Validate a message; how much it holds is looked at first.
 
     Parameters
     ----------
@@ -64,22 +78,35 @@ def check(model: type[M], message: Mapping[str, Any] | bytes, *, what: str) -> M
         The parsed message, or its JSON text.
     what : str
         What the message is called in errors about the whole of it.
+    check_counts : callable, optional
+        Raises InvalidReportError when a message, which need not be valid, has too much of something.
 
     Raises
     ------
     MalformedJsonError
         For bytes that are not JSON.
     InvalidReportError
-        For a message that does not fit; it lists all its problems, at most 50.
+        For a message that does not fit.
     """
+    if isinstance(message, bytes) and len(message) > _SHORT and has_more_values(message, MAX_MESSAGE_VALUES):
+        raise too_much((), f"{what} has more than {MAX_MESSAGE_VALUES} values; leave out what is not read")
     data = read_json(message) if isinstance(message, bytes) else message
+    if isinstance(data, Mapping):
+        data = dict(data)
+        stations = data.get("stations")
+        if isinstance(stations, Mapping) and len(stations) > MAX_STATIONS:
+            raise too_much(("stations",), f"stations has {len(stations)} names; give at most {MAX_STATIONS}")
+        if check_counts is not None:
+            check_counts(data)
     try:
-        return model.model_validate(dict(data) if isinstance(data, Mapping) else data)
+        return model.model_validate(data)
     except ValidationError as error:
-        details = error.errors(include_url=False)[:_MAX_PROBLEMS]
-        # A misspelt key comes with a missing one; the first message should be the one that says so.
-        details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
-        raise InvalidReportError(tuple(_problem(model, detail, what) for detail in details)) from None
+        raise invalid_report(error, model, data, lambda detail: _problem(model, detail, what)) from None
+
+
+def too_much(path: Path, text: str) -> InvalidReportError:
+    """Make the error of a message that has too much of something."""
+    return InvalidReportError((FieldProblem(path=path, message=text),))
 
 
 def one_of(model: WireModel) -> tuple[str, Any]:

@@ -4,8 +4,10 @@ import asyncio
 import json
 import logging
 import ssl
+from collections import Counter
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
+from string import Formatter
 from time import monotonic, perf_counter
 from typing import Any
 from urllib.parse import urlsplit
@@ -19,11 +21,13 @@ from rayfix_service.adapters.silabs_stream import SilabsStream
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Frame, Height
 from rayfix_service.tracking.tracker import Tracker
+from rayfix_service.wire.names import MAX_NAME, in_log, topic_level
 from rayfix_tables.errors import RayfixError, ReportError
 
 _log = logging.getLogger(__name__)
 
 _LONGEST_PAUSE = 30.0  # s, between attempts to connect again
+_MOST_TOPIC_BYTES = 65_535  # of MQTT
 _MOST_WAITING = 10_000  # messages; when they come faster than fixes are computed, the newest are dropped
 
 
@@ -107,13 +111,14 @@ def check_settings(settings: MqttSettings) -> None:
     if not 0.0 < settings.window <= 60.0:
         raise BrokerError(f"window is {settings.window:g}; give more than 0 and at most 60 seconds")
     try:
-        topic = settings.publish.format(target_id="tag")
-    except (KeyError, IndexError, ValueError):
-        topic = ""
-    if not topic or set(topic) & set("+#"):
+        topic = topic_for(settings.publish, "tag")
+        length = len(topic_for(settings.publish, "\uffff" * MAX_NAME).encode())  # no name of a tag becomes longer
+    except ValueError:
+        topic, length = "", 0
+    if not topic or set(topic) & set("+#\0") or length > _MOST_TOPIC_BYTES:
         raise BrokerError(
-            f"topic {settings.publish!r} cannot be published to; give one without + and #, "
-            "and with no placeholder but {target_id}"
+            f"topic {in_log(settings.publish)!r} cannot be published to; give a short one without +, # and control "
+            "characters, and with no placeholder but {target_id}"
         )
     try:
         loops = aiomqtt.Topic(topic).matches(settings.topic)
@@ -121,6 +126,24 @@ def check_settings(settings: MqttSettings) -> None:
         raise BrokerError(f"topic {settings.topic!r} is no topic filter; give e.g. silabs/aoa/angle/+/+") from None
     if loops:
         raise BrokerError(f"topic {settings.publish!r} is among those read, {settings.topic!r}; give another")
+
+
+def topic_for(publish: str, target_id: str) -> str:
+    """Write the topic of a target's positions; its name is one level of it, whatever it holds.
+
+    Raises
+    ------
+    ValueError
+        When the topic has another placeholder than ``{target_id}``.
+    """
+    parts = []
+    for text, name, form, conversion in Formatter().parse(publish):
+        parts.append(text)
+        if name is not None:
+            if name != "target_id" or form or conversion:
+                raise ValueError(publish)
+            parts.append(topic_level(target_id))
+    return "".join(parts)
 
 
 async def run_mqtt(
@@ -149,7 +172,10 @@ async def run_mqtt(
     tracker = Tracker(locator.table.scene) if settings.track else None
     async with open_hub(settings.hub) as hub:
         session = _Session(locator=locator, settings=settings, stream=stream, tracker=tracker, hub=hub)
-        await _run_session(session, broker, on_ready)
+        try:
+            await _run_session(session, broker, on_ready)
+        finally:
+            _log.info("%s", session.summary())
 
 
 async def _run_session(session: "_Session", broker: Broker, on_ready: Callable[[], None] | None) -> None:
@@ -165,11 +191,11 @@ async def _run_session(session: "_Session", broker: Broker, on_ready: Callable[[
                 if on_ready is not None:
                     on_ready()
                 await _first_of(session.read(client), session.watch(client))
-        except (aiomqtt.MqttError, OSError) as error:
+        except (aiomqtt.MqttError, OSError, ValueError) as error:  # ValueError: of a topic that is none
             if not connected:
                 text = f"cannot use the MQTT broker {place} ({error}); check its address and your rights"
                 raise BrokerError(text) from error
-            _log.warning("lost the broker %s (%s), trying again in %g s", place, error, pause)
+            _log.warning("lost the broker %s (%s), trying again in %g s", place, in_log(str(error), most=1000), pause)
         await asyncio.sleep(pause)
         pause = min(2.0 * pause, _LONGEST_PAUSE)
 
@@ -207,12 +233,28 @@ class _Session:
     stream: SilabsStream
     tracker: Tracker | None
     hub: OmloxHub | None
+    failed: Counter[str] = field(default_factory=Counter)
+
+    def summary(self) -> str:
+        """Count what gave no position, in words."""
+        return (
+            f"{self.stream.num_passed_over} messages passed over, {self.stream.num_repeated} delivered twice; "
+            f"{self.failed['no position']} packets without a position, {self.failed['defect']} that failed"
+        )
 
     async def read(self, client: aiomqtt.Client) -> None:
-        """Take all messages."""
+        """Take all messages; one that cannot be read costs nothing but itself."""
         async for message in client.messages:
             if isinstance(message.payload, bytes):
-                await self._publish(client, self.stream.receive(message.topic.value, message.payload, monotonic()))
+                await self._publish(client, self._receive(message.topic.value, message.payload))
+
+    def _receive(self, topic: str, payload: bytes) -> list[Adapted]:
+        try:
+            return self.stream.receive(topic, payload, monotonic())
+        except Exception:
+            self.failed["defect"] += 1
+            _log.exception("a message of '%s' failed", in_log(topic))
+            return []
 
     async def watch(self, client: aiomqtt.Client) -> None:
         """End packets that not all locators have heard."""
@@ -222,17 +264,23 @@ class _Session:
 
     async def _publish(self, client: aiomqtt.Client, reports: list[Adapted]) -> None:
         for adapted in reports:
+            target = in_log(adapted.report.target_id or "")
             try:
-                document = self._answer(adapted)
+                document = json.dumps(self._answer(adapted))
             except ReportError as error:
-                _log.info("no position of '%s': %s", adapted.report.target_id, error)
+                self.failed["no position"] += 1
+                _log.info("no position of '%s': %s", target, in_log(str(error), most=1000))
                 continue
             except Exception:
                 # A defect that one packet meets must not end the service.
-                _log.exception("a packet of '%s' failed", adapted.report.target_id)
+                self.failed["defect"] += 1
+                _log.exception("a packet of '%s' failed", target)
                 continue
-            topic = self.settings.publish.format(target_id=adapted.report.target_id)
-            await client.publish(topic, json.dumps(document))
+            try:
+                await client.publish(topic_for(self.settings.publish, adapted.report.target_id or ""), document)
+            except ValueError as error:  # of paho: a topic or a message that MQTT does not carry
+                self.failed["defect"] += 1
+                _log.error("a position of '%s' cannot be published: %s", target, error)
 
     def _answer(self, adapted: Adapted) -> dict[str, Any]:
         """Locate a packet, go on with its tag's track, and tell the hub."""

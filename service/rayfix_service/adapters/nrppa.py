@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rayfix_service.adapters.adapted import Adapted, Skipped, adapted_report, station_of
-from rayfix_service.adapters.documents import check, one_of
+from rayfix_service.adapters.documents import check, one_of, too_much
 from rayfix_service.adapters.nrppa_documents import (
     AngleQuality,
     GnbRxTx,
@@ -19,6 +19,7 @@ from rayfix_service.adapters.nrppa_documents import (
     ResultItem,
     TimeChoice,
     TimingQuality,
+    UeRxTx,
     UlAoa,
     UlRtoa,
     Zoa,
@@ -26,11 +27,14 @@ from rayfix_service.adapters.nrppa_documents import (
 from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_interval, time_interval
 from rayfix_service.fusion.measurements.directions import to_scene
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, TimeOfArrival
-from rayfix_service.wire.problems import Path
+from rayfix_service.wire.problems import Path, path_text
 from rayfix_tables.angles import wrap_one
 from rayfix_tables.site import Station
 
 _RESOLUTION_M = {"m0dot1": 0.1, "mdot1": 0.1, "m1": 1.0, "m10": 10.0, "m30": 30.0}
+
+_TURN = 2.0 * math.pi
+_LARGEST_STDEV_M = 1e6  # that a report takes
 
 _BEYOND = "its value stands for everything beyond the range of the report mapping"
 _NO_AZIMUTH = "a zenith angle without an azimuth cannot be used; report UL-AoA with both"
@@ -38,6 +42,12 @@ _NO_ZENITH = "an azimuth without a zenith angle cannot be turned by beta and gam
 _ALONE = "a gNB's Rx-Tx time difference is a range only together with the UE's; give that in ue_rx_tx"
 _POWER = "powers and phases are not used"
 _MORE_PATHS = "times of additional paths are not used; angles of several paths are, as MultipleULAoA"
+
+
+MAX_RESULTS = 1024
+"""Measurements that one message may have, all TRPs together, each angle of a MultipleULAoA counted."""
+
+_LISTS = ("TRP-MeasurementResponseList", "TRP-MeasurementReportList")
 
 
 def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, str] | None = None) -> Adapted:
@@ -64,13 +74,18 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
     InvalidReportError
         For a message that is not valid, or of which no measurement can be used.
     """
-    document = check(NrppaDocument, message, what="the NRPPa message")
-    name = "TRP-MeasurementResponseList" if document.response else "TRP-MeasurementReportList"
+    document = check(NrppaDocument, message, what="the NRPPa message", check_counts=_check_counts)
+    name = _LISTS[0] if document.response else _LISTS[1]
+    ranges_to: dict[int, list[UeRxTx]] = {}
+    for ue in document.ue_rx_tx:
+        ranges_to.setdefault(ue.trp_id, []).append(ue)
     measurements: list[tuple[Path, Measurement]] = []
     skipped: list[Skipped] = []
     for i, trp in enumerate(document.response or document.report or ()):
         converter = _Converter(
-            document=document, trp_id=trp.trp_id, station_id=station_of(str(trp.trp_id), document.stations, stations)
+            document=document,
+            station_id=station_of(str(trp.trp_id), document.stations, stations),
+            ue_rx_tx=ranges_to.get(trp.trp_id, []),
         )
         for k, item in enumerate(trp.results):
             path: Path = (name, i, "measurementResult", k)
@@ -79,6 +94,11 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
                     skipped.append(Skipped(path=(*path, *place), reason=outcome))
                 else:
                     measurements.append(((*path, *place), _with_sight(outcome, item.los)))
+            if len(measurements) + len(skipped) > 2 * MAX_RESULTS:  # each may be one range for every ue_rx_tx
+                text = (
+                    f"ue_rx_tx makes more than {2 * MAX_RESULTS} measurements of the message's; give one for each TRP"
+                )
+                raise too_much(("ue_rx_tx",), text)
     return adapted_report(
         measurements,
         skipped,
@@ -88,13 +108,40 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
     )
 
 
+def _check_counts(message: Mapping[str, Any]) -> None:
+    """Count the measurements of a message that need not be valid.
+
+    Raises
+    ------
+    InvalidReportError
+        When there are too many.
+    """
+    num_results = 0
+    for name in _LISTS:
+        for trp in _array(message.get(name))[:64]:  # more are refused unread
+            for item in _array(trp.get("measurementResult") if isinstance(trp, Mapping) else None):
+                value = item.get("measuredResultsValue") if isinstance(item, Mapping) else None
+                several = value.get("MultipleULAoA") if isinstance(value, Mapping) else None
+                angles = several.get("multipleULAoA") if isinstance(several, Mapping) else None
+                num_results += max(len(_array(angles)), 1)
+                if num_results > MAX_RESULTS:
+                    text = (
+                        f"{path_text((name,))} has more than {MAX_RESULTS} measurements; give at most as many at once"
+                    )
+                    raise too_much((name,), text)
+
+
+def _array(value: object) -> list[Any] | tuple[Any, ...]:
+    return value if isinstance(value, list | tuple) else ()
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Converter:
     """Conversion of one TRP's measurements: pairs of a place within the item, and a measurement or a reason."""
 
     document: NrppaDocument
-    trp_id: int
     station_id: str
+    ue_rx_tx: list[UeRxTx]
 
     def convert(self, item: ResultItem) -> Iterator[tuple[Path, Angle | Range | TimeOfArrival | str]]:
         """Convert one item, which may hold several measurements or none."""
@@ -125,9 +172,7 @@ class _Converter:
             return _NO_AZIMUTH
         azimuth = angle_interval(measured.azimuth, zero=math.radians(self.document.azimuth_zero_deg))
         default = math.radians(self.document.angle_stdev_deg)
-        azimuth_stdev = math.sqrt(
-            (_steps(quality.azimuth) * ANGLE_STEP if quality else default) ** 2 + azimuth.variance
-        )
+        azimuth_stdev = _angle_stdev(_steps(quality.azimuth) * ANGLE_STEP if quality else default, azimuth)
         if measured.zenith is None:
             if measured.translation is None:
                 turn = 0.0
@@ -143,7 +188,7 @@ class _Converter:
             )
         zenith = angle_interval(measured.zenith)
         known = quality.zenith if quality else None
-        zenith_stdev = math.sqrt((default if known is None else _steps(known) * ANGLE_STEP) ** 2 + zenith.variance)
+        zenith_stdev = _angle_stdev(default if known is None else _steps(known) * ANGLE_STEP, zenith)
         angle = Angle(
             station_id=self.station_id,
             azimuth=wrap_one(azimuth.middle),
@@ -161,15 +206,14 @@ class _Converter:
         return TimeOfArrival(
             station_id=self.station_id,
             path_length=measured.middle,
-            stdev=math.sqrt(self._time_variance(measured, quality)),
+            stdev=min(math.sqrt(self._time_variance(measured, quality)), _LARGEST_STDEV_M),
         )
 
     def _ranges(self, time: TimeChoice, quality: TimingQuality | None) -> Iterator[Range | str]:
         mine = time_interval(*time.value_and_k())
-        others = [ue for ue in self.document.ue_rx_tx if ue.trp_id == self.trp_id]
-        if not others:
+        if not self.ue_rx_tx:
             yield _ALONE
-        for ue in others:
+        for ue in self.ue_rx_tx:
             theirs = time_interval(*ue.time.value_and_k())
             if mine is None or theirs is None:
                 yield _BEYOND
@@ -203,6 +247,11 @@ def _with_sight(measurement: Angle | Range | TimeOfArrival, los: LosInformation 
     return replace(measurement, los_probability=value / 10.0 if name.endswith("Soft") else float(value == "los"))
 
 
+def _angle_stdev(stdev: float, measured: Interval) -> float:
+    """Add the quantisation's variance to a standard deviation; a report takes a full turn at most."""
+    return min(math.sqrt(stdev**2 + measured.variance), _TURN)
+
+
 def _steps(quality: int) -> float:
     """Uncertainty in steps; 0 stands for less than half a step."""
     return max(float(quality), 0.5)
@@ -224,7 +273,7 @@ def _to_global(translation: LcsToGcs, angle: Angle) -> Angle:
         azimuth=turned.azimuth,
         zenith=turned.zenith,
         # Beyond a full turn an azimuth is unknown, which is the case right at the zenith.
-        azimuth_stdev=min(float(stdev[0]), 2.0 * np.pi),
-        zenith_stdev=float(stdev[1]),
+        azimuth_stdev=min(float(stdev[0]), _TURN),
+        zenith_stdev=min(float(stdev[1]), _TURN),
         correlation=float(np.clip(turned.cov[0, 1] / (stdev[0] * stdev[1]), -0.999, 0.999)),
     )

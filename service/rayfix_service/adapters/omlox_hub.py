@@ -12,20 +12,24 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
-from urllib.parse import quote, urlsplit
+from urllib.parse import urlsplit
 
 import httpx
 
 from rayfix_service.adapters.omlox import fix_to_omlox
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.tracking.track import TrackedPosition
-from rayfix_tables.errors import RayfixError
+from rayfix_service.wire.names import in_log, path_segment
+from rayfix_tables.errors import RayfixError, ReportError
 from rayfix_tables.site import SiteInfo
 
 _log = logging.getLogger(__name__)
 
 HubOutcome = Literal["sent", "refused", "dropped"]
 """What became of a location: the hub took it, said that it never will, or there was no room or patience left."""
+
+MAX_ANSWER = 4096
+"""Bytes of a hub's answer that are read, for the sake of the connection; nothing of them is used."""
 
 _PASSING = frozenset({408, 425, 429, 500, 502, 503, 504})
 """Statuses of a hub that may take the same location later."""
@@ -54,6 +58,7 @@ class HubSettings:
     first_pause, longest_pause : float, s
         Before the second attempt, and at most; each is twice as long as that before.
     timeout : float, s
+        From the beginning of an attempt to the end of the hub's answer, however the hub sends it.
     """
 
     url: str
@@ -95,7 +100,7 @@ class OmloxHub:
 
     def put(self, location: dict[str, Any]) -> None:
         """Send a location and return at once."""
-        lane = self._lanes[zlib.crc32(location["provider_id"].encode()) % len(self._lanes)]
+        lane = self._lanes[zlib.crc32(location["provider_id"].encode("utf-8", "surrogatepass")) % len(self._lanes)]
         if len(lane.waiting) == self._settings.capacity:
             lane.waiting.popleft()
             self._on_outcome("dropped")
@@ -109,7 +114,9 @@ class OmloxHub:
 
     async def run(self) -> None:
         """Send until cancelled."""
-        headers = {} if self._settings.token is None else {"authorization": f"Bearer {self._settings.token}"}
+        headers = {"accept-encoding": "identity"}
+        if self._settings.token is not None:
+            headers["authorization"] = f"Bearer {self._settings.token}"
         async with (
             httpx.AsyncClient(headers=headers, timeout=self._settings.timeout) as client,
             asyncio.TaskGroup() as group,
@@ -134,19 +141,25 @@ class OmloxHub:
 
     async def _send(self, client: httpx.AsyncClient, location: dict[str, Any]) -> HubOutcome:
         settings = self._settings
-        url = f"{settings.url.rstrip('/')}/providers/{quote(location['provider_id'], safe='')}/location"
+        try:
+            url = f"{settings.url.rstrip('/')}/providers/{path_segment(location['provider_id'])}/location"
+        except ReportError as error:
+            _log.warning("a position is not sent to the omlox hub: %s", error)
+            return "refused"
         pause = settings.first_pause
         for attempt in range(1, settings.attempts + 1):
             try:
-                answer = await client.put(url, json=location)
+                status = await self._put(client, url, location)
+            except TimeoutError:
+                reason = f"no answer within {settings.timeout:g} s"
             except httpx.HTTPError as error:
-                reason = str(error) or type(error).__name__
+                reason = in_log(str(error), most=1000) or type(error).__name__
             else:
-                if answer.is_success:
+                if 200 <= status < 300:
                     self._tell_once(failing=False, reason="")
                     return "sent"
-                reason = f"status {answer.status_code}"
-                if answer.status_code not in _PASSING:
+                reason = f"status {status}"
+                if status not in _PASSING:
                     self._tell_once(failing=True, reason=reason)
                     return "refused"
             self._tell_once(failing=True, reason=reason)
@@ -154,6 +167,30 @@ class OmloxHub:
                 await asyncio.sleep(pause)
                 pause = min(2.0 * pause, settings.longest_pause)
         return "dropped"
+
+    async def _put(self, client: httpx.AsyncClient, url: str, location: dict[str, Any]) -> int:
+        """Make one attempt; returns the status, which counts even if the rest of the answer is long or does not come.
+
+        Raises
+        ------
+        TimeoutError, httpx.HTTPError
+            When there is no status in time.
+        """
+        status = None
+        try:
+            async with (
+                asyncio.timeout(self._settings.timeout),
+                client.stream("PUT", url, json=location) as answer,  # left early, it closes the connection
+            ):
+                status, length = answer.status_code, 0
+                async for part in answer.aiter_raw():
+                    length += len(part)
+                    if length > MAX_ANSWER:
+                        break
+        except (TimeoutError, httpx.HTTPError):
+            if status is None:
+                raise
+        return status
 
     def _tell_once(self, *, failing: bool, reason: str) -> None:
         """Log the first failure of several, and their end."""

@@ -8,16 +8,27 @@ from rayfix_service.adapters.adapted import Adapted, adapted_report, station_of
 from rayfix_service.adapters.silabs import LEAST_STDEV_DEG, SilabsAngle, parse_silabs_angle, silabs_measurements
 from rayfix_service.adapters.transmissions import Joiner, Transmission
 from rayfix_service.fusion.measurements.report import Frame, Height
+from rayfix_service.wire.names import MAX_NAME, in_log
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo
 
 _log = logging.getLogger(__name__)
 
+MAX_PAYLOAD = 64 << 10
+"""Bytes of a message that is read; an angle has some hundred."""
+
+_MOST_PACKETS = 20_000
+"""Packets that wait for more locators, and that are remembered as ended; beyond that, the oldest end early."""
+
+_MOST_SOURCES = 1000
+"""Locators of which it is remembered that the log tells of them; a broker may have topics without end."""
+
 
 class SilabsStream:
     """Takes messages of topics that end in ``<locator>/<tag>``, and gives a report for each packet of a tag.
 
-    A message that cannot be used is passed over; the log tells of the first of each locator.
+    A message that cannot be used is passed over and counted; the log tells of the first of each locator. One that is
+    delivered twice, as MQTT may with quality of service 1, is taken once.
 
     Parameters
     ----------
@@ -33,6 +44,11 @@ class SilabsStream:
         Least standard deviation to believe.
     height : Height, optional
         What is known of the height of all tags.
+
+    Attributes
+    ----------
+    num_passed_over : int
+        Messages that could not be used.
     """
 
     def __init__(
@@ -46,28 +62,44 @@ class SilabsStream:
         height: Height | None = None,
     ) -> None:
         self._known = {station.id for station in site.stations}
-        self._joiner: Joiner[tuple[datetime, SilabsAngle]] = Joiner(window=window, num_stations=len(self._known))
+        self._joiner: Joiner[tuple[datetime, SilabsAngle]] = Joiner(
+            window=window, num_stations=len(self._known), repeats=_same_angle, most=_MOST_PACKETS
+        )
         self._stations = stations
         self._frame: Frame = frame
         self._least_stdev_deg = least_stdev_deg
         self._height = height
         self._told: set[str] = set()
+        self.num_passed_over = 0
+
+    @property
+    def num_repeated(self) -> int:
+        """Messages that were delivered twice."""
+        return self._joiner.num_repeated
 
     def receive(self, topic: str, payload: bytes, now: float) -> list[Adapted]:
         """Take a message that arrived at `now`, s of any clock; returns the reports that it completes."""
         levels = topic.split("/")
         if len(levels) < 2 or not (levels[-2] and levels[-1]):
-            self._tell(topic, f"the topic '{topic}' does not end in <locator>/<tag>; subscribe to others")
+            self._tell(topic, f"the topic '{in_log(topic)}' does not end in <locator>/<tag>; subscribe to others")
             return []
         locator, tag = levels[-2:]
+        if len(tag) > MAX_NAME:
+            self._tell(locator, f"the tag '{in_log(tag)}' has {len(tag)} characters; give it at most {MAX_NAME}")
+            return []
+        if len(payload) > MAX_PAYLOAD:
+            self._tell(locator, f"the message has {len(payload)} bytes; an angle has at most {MAX_PAYLOAD}")
+            return []
         station_id = station_of(locator, self._stations)
         if station_id not in self._known:
-            self._tell(locator, f"station '{station_id}' is not in the table; name one, or say which one is meant")
+            self._tell(
+                locator, f"station '{in_log(station_id)}' is not in the table; name one, or say which one is meant"
+            )
             return []
         try:
             angle = parse_silabs_angle(payload)
         except ReportError as error:
-            self._tell(locator, str(error))
+            self._tell(locator, in_log(str(error), most=1000))
             return []
         moment = datetime.now(UTC)
         return self._reports(self._joiner.add(tag, station_id, angle.sequence, (moment, angle), now))
@@ -94,8 +126,14 @@ class SilabsStream:
         )
 
     def _tell(self, source: str, text: str) -> None:
-        level = logging.DEBUG if source in self._told else logging.WARNING
-        # A broker may have topics without end.
-        if len(self._told) < 1000:
+        self.num_passed_over += 1
+        source = in_log(source)
+        level = logging.DEBUG if source in self._told or len(self._told) >= _MOST_SOURCES else logging.WARNING
+        if level == logging.WARNING:
             self._told.add(source)
         _log.log(level, "message of %s passed over: %s", source, text)
+
+
+def _same_angle(before: tuple[datetime, SilabsAngle], after: tuple[datetime, SilabsAngle]) -> bool:
+    """Tell whether an angle is the one that its locator sent before."""
+    return before[1] == after[1]

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rayfix_service.adapters.adapted import Adapted, adapted_report, station_of
-from rayfix_service.adapters.transmissions import Joiner
+from rayfix_service.adapters.transmissions import Joiner, Transmission
 from rayfix_service.fusion.measurements.report import Angle
 from rayfix_service.wire import MAX_REPORTS, FieldProblem, InvalidReportError
 from rayfix_service.wire.problems import Path, shown
@@ -139,7 +139,7 @@ def parse_ublox(
     if isinstance(text, bytes):
         text = text.decode("utf-8", errors="replace")
     joiner: Joiner[tuple[int, UudfEvent]] = Joiner(window=math.inf)
-    joined = []
+    joined: list[Transmission[tuple[int, UudfEvent]]] = []
     for number, line in enumerate(text.splitlines()):
         if not line.strip().startswith(_PREFIX):
             continue
@@ -149,12 +149,12 @@ def parse_ublox(
             message = f"line {number + 1} {str(error).removeprefix('the line ')}"
             raise InvalidReportError((FieldProblem(path=("lines", number), message=message),)) from None
         joined += joiner.add(event.tag, event.anchor, event.sequence, (number, event), 0.0)
+        if len(joined) + len(joiner) > MAX_REPORTS:
+            text = f"the lines are more than {MAX_REPORTS} reports; give at most {MAX_REPORTS} at once"
+            raise InvalidReportError((FieldProblem(path=(), message=text),))
     joined += joiner.flush()
     if not joined:
         raise InvalidReportError((FieldProblem(path=(), message=f"no line begins with {_PREFIX}; give at least one"),))
-    if len(joined) > MAX_REPORTS:
-        text = f"the lines are {len(joined)} reports; give at most {MAX_REPORTS} at once"
-        raise InvalidReportError((FieldProblem(path=(), message=text),))
     joined.sort(key=lambda transmission: min(number for number, _ in transmission.heard.values()))
     reports = []
     for transmission in joined:

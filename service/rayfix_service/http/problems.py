@@ -10,7 +10,8 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
-from rayfix_service.wire import FieldProblem, MalformedJsonError, path_text, problems_of
+from rayfix_service.wire import FieldProblem, MalformedJsonError, more_problems, path_text, problems_of
+from rayfix_service.wire.problems import MAX_PROBLEMS
 from rayfix_tables.errors import ReportError
 
 MEDIA_TYPE = "application/problem+json"
@@ -86,7 +87,10 @@ class Problem(BaseModel):
     title: str = Field(description="the kind of problem in words", examples=[INVALID_REPORT.title])
     status: int = Field(description="the HTTP status", examples=[INVALID_REPORT.status])
     detail: str = Field(description="what is wrong this time, and what to do about it")
-    errors: list[ProblemField] = Field(description="every offending field, at most 50")
+    errors: list[ProblemField] = Field(description=f"the offending fields, at most {MAX_PROBLEMS}")
+    more_errors: int = Field(
+        default=0, description="how many offending fields are left out of errors; absent when none is"
+    )
 
 
 class ProblemError(Exception):
@@ -106,21 +110,26 @@ class ProblemError(Exception):
         self.headers = headers
 
 
-def problem_document(kind: ProblemKind, detail: str, errors: Iterable[FieldProblem] = ()) -> dict[str, Any]:
+def problem_document(
+    kind: ProblemKind, detail: str, errors: Iterable[FieldProblem] = (), more_errors: int = 0
+) -> dict[str, Any]:
     """Build the document that :class:`Problem` describes."""
-    return {
+    document = {
         "type": kind.uri,
         "title": kind.title,
         "status": kind.status,
         "detail": detail,
         "errors": [{"path": path_text(error.path), "message": error.message} for error in errors],
     }
+    if more_errors:
+        document["more_errors"] = more_errors
+    return document
 
 
 def report_problem(error: ReportError) -> dict[str, Any]:
     """Build the document of a report that cannot be used."""
     kind = MALFORMED_JSON if isinstance(error, MalformedJsonError) else INVALID_REPORT
-    return problem_document(kind, str(error), problems_of(error))
+    return problem_document(kind, str(error), problems_of(error), more_problems(error))
 
 
 def internal_problem() -> dict[str, Any]:
@@ -160,7 +169,8 @@ async def _answer_validation(request: Request, error: Exception) -> JSONResponse
         FieldProblem(path=tuple(e["loc"][1:]), message=f"{path_text(tuple(e['loc'][1:]))}: {e['msg']}")
         for e in error.errors()
     ]
-    return problem_response(problem_document(INVALID_PARAMETER, errors[0].message, errors))
+    listed = errors[:MAX_PROBLEMS]
+    return problem_response(problem_document(INVALID_PARAMETER, errors[0].message, listed, len(errors) - len(listed)))
 
 
 async def _answer_http(request: Request, error: Exception) -> JSONResponse:

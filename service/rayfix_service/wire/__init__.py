@@ -16,6 +16,7 @@ from rayfix_service.wire.problems import (
     FieldProblem,
     InvalidReportError,
     MalformedJsonError,
+    more_problems,
     path_text,
     problems_of,
 )
@@ -36,6 +37,7 @@ __all__ = [
     "ReportDocument",
     "WireModel",
     "fix_to_document",
+    "more_problems",
     "parse_report",
     "path_text",
     "problems_of",

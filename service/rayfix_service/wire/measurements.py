@@ -292,11 +292,11 @@ class SignalStrengthDocument(WireModel):
     @model_validator(mode="after")
     def _near_enough(self) -> Self:
         length, log_stdev = self._range()
-        if not 1e-3 <= length <= _LONGEST:
+        if not _SHORTEST * (1.0 - _DIGITS) <= length <= _LONGEST * (1.0 + _DIGITS):
             raise misfit(
                 "rssi_dbm", f"is of a path of {length:.3g} m by this model; check power_at_1m_dbm and exponent"
             )
-        if log_stdev > _WIDEST_LOG:
+        if log_stdev > _WIDEST_LOG * (1.0 + _DIGITS):
             raise misfit(
                 "shadowing_stdev_db", "leaves the distance open; give at most 6.5 dB for each unit of exponent"
             )
@@ -314,8 +314,18 @@ class SignalStrengthDocument(WireModel):
     def measurement(self) -> LogRange:
         """Convert to a path length and the deviation of its logarithm."""
         length, log_stdev = self._range()
-        return LogRange(station_id=self.station_id, path_length=length, log_stdev=log_stdev)
+        return LogRange(
+            station_id=self.station_id,
+            path_length=min(max(length, _SHORTEST), _LONGEST),
+            log_stdev=min(log_stdev, _WIDEST_LOG),
+        )
 
+
+_SHORTEST = 1e-3
+"""Shortest path that a signal strength may be of, m."""
+
+_DIGITS = 1e-9
+"""Share of a limit that rounding may be beyond it, where a model's numbers are made of a length at the limit."""
 
 _WIDEST_LOG = 1.5
 """Largest standard deviation of a distance's logarithm that the fusion takes: a factor of 4.5."""

@@ -9,7 +9,7 @@
 
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import get_args
 
@@ -18,10 +18,13 @@ from pydantic_core import ErrorDetails
 
 from rayfix_service.wire.documents import HeightDocument, ReportDocument
 from rayfix_service.wire.fields import MISFIT, WireModel
+from rayfix_service.wire.limits import names_of, trimmed
 from rayfix_service.wire.measurements import MEASUREMENT_DOCUMENTS
 from rayfix_tables.errors import ReportError
 
-_MAX_PROBLEMS = 50  # a megabyte of unknown keys must not become megabytes of complaints
+MAX_PROBLEMS = 50
+"""Problems that an error lists; it counts the others. A megabyte of unknown keys must not become megabytes of text."""
+
 _MAX_SHOWN = 60  # characters of a value or a key that a message repeats
 
 Path = tuple[str | int, ...]
@@ -53,13 +56,22 @@ class InvalidReportError(ReportError):
     Parameters
     ----------
     problems : tuple of FieldProblem
-        At least one; the first gives the error its message and its ``path``.
+        At least one; the first gives the error its message and its ``path``. Those beyond ``MAX_PROBLEMS`` are counted
+        and left out.
+    more : int
+        Problems that were found besides.
     """
 
-    def __init__(self, problems: tuple[FieldProblem, ...]) -> None:
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        super().__init__(problems[0].message + more, path=problems[0].path)
-        self.problems = problems
+    def __init__(self, problems: tuple[FieldProblem, ...], more: int = 0) -> None:
+        others = len(problems) - 1 + more
+        text = f" (and {others} more)" if others else ""
+        super().__init__(problems[0].message + text, path=problems[0].path)
+        self.problems = problems[:MAX_PROBLEMS]
+        self.more = more + len(problems) - len(self.problems)
+
+    def __reduce__(self) -> tuple[type["InvalidReportError"], tuple[tuple[FieldProblem, ...], int]]:
+        """Pickle what it is made from: processes of a batch hand errors to each other."""
+        return type(self), (self.problems, self.more)
 
 
 def problems_of(error: ReportError) -> tuple[FieldProblem, ...]:
@@ -69,12 +81,45 @@ def problems_of(error: ReportError) -> tuple[FieldProblem, ...]:
     return (FieldProblem(path=error.path, message=str(error)),)
 
 
-def problems_of_validation(error: ValidationError) -> tuple[FieldProblem, ...]:
-    """Say in this project's words what pydantic found wrong with a report, at most 50 things."""
-    details = error.errors(include_url=False)[:_MAX_PROBLEMS]
+def more_problems(error: ReportError) -> int:
+    """Count what is wrong according to `error` beyond what :func:`problems_of` lists."""
+    return error.more if isinstance(error, InvalidReportError) else 0
+
+
+def invalid_report(
+    error: ValidationError,
+    model: type[WireModel],
+    document: object,
+    problem_of: Callable[[ErrorDetails], FieldProblem],
+    most: int = MAX_PROBLEMS,
+) -> InvalidReportError:
+    """Say in this project's words what pydantic found wrong with a document.
+
+    The time and memory that this takes do not grow with the number of errors, which a megabyte can have 100,000 of.
+
+    Parameters
+    ----------
+    error : ValidationError
+    model : type of WireModel
+        Model of the document.
+    document : object
+        The document itself.
+    problem_of : callable
+        Words an error.
+    most : int
+        Problems that the error lists at most, the first ones; the others are counted.
+    """
+    found = error.error_count()
+    if found > MAX_PROBLEMS:
+        try:
+            model.model_validate(trimmed(document, names_of(model), MAX_PROBLEMS))
+        except ValidationError as fewer:
+            error = fewer
+    details = error.errors(include_url=False)[:MAX_PROBLEMS]
     # A misspelt key comes with a missing one; the first message should be the one that says so.
     details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
-    return tuple(_problem(detail) for detail in details)
+    problems = tuple(problem_of(detail) for detail in details[:most])
+    return InvalidReportError(problems, found - len(problems))
 
 
 def path_text(path: Path) -> str:
@@ -110,7 +155,8 @@ def _shortened(text: str) -> str:
     return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
 
 
-def _problem(error: ErrorDetails) -> FieldProblem:
+def report_problem_of(error: ErrorDetails) -> FieldProblem:
+    """Word what pydantic found wrong with a report."""
     path, kind, value, context = error["loc"], error["type"], error["input"], error.get("ctx", {})
     model: type[WireModel] = ReportDocument
     if len(path) > 2 and path[0] == "measurements":

@@ -7,8 +7,19 @@ from pydantic import ValidationError
 from pydantic_core import from_json
 
 from rayfix_service.fusion.measurements.report import Report
-from rayfix_service.wire.documents import ReportDocument
-from rayfix_service.wire.problems import InvalidReportError, MalformedJsonError, problems_of_validation
+from rayfix_service.wire.documents import MAX_MEASUREMENTS, ReportDocument
+from rayfix_service.wire.limits import MAX_VALUES, has_more_values
+from rayfix_service.wire.problems import (
+    MAX_PROBLEMS,
+    FieldProblem,
+    InvalidReportError,
+    MalformedJsonError,
+    invalid_report,
+    report_problem_of,
+)
+
+_SHORT = 16 << 10
+"""Bytes of a report that is validated without a look at how many values it has."""
 
 
 def read_json(body: bytes) -> object:
@@ -30,22 +41,27 @@ def read_json(body: bytes) -> object:
         raise MalformedJsonError(f"the document is not JSON: {error}; give one complete JSON object in UTF-8") from None
 
 
-def parse_report(document: Mapping[str, Any] | bytes) -> Report:
+def parse_report(document: Mapping[str, Any] | bytes, *, most_problems: int = MAX_PROBLEMS) -> Report:
     """Turn a report's JSON into a :class:`Report`.
 
     Parameters
     ----------
     document : Mapping or bytes
         The parsed document, or its JSON text.
+    most_problems : int
+        Problems that an error lists at most; it counts the others.
 
     Raises
     ------
     MalformedJsonError
         For bytes that are not JSON.
     InvalidReportError
-        For a document that is not a valid report; it lists all its problems.
+        For a document that is not a valid report, or a text of more values than a report can have.
     """
-    model = _validate_text(document) if isinstance(document, bytes) else _validate(document)
+    if isinstance(document, bytes):
+        model = _validate_text(document, most_problems)
+    else:
+        model = _validate(document, most_problems)
     return Report(
         measurements=tuple(m.measurement() for m in model.measurements),
         height=None if model.height is None else model.height.height(),
@@ -55,15 +71,19 @@ def parse_report(document: Mapping[str, Any] | bytes) -> Report:
     )
 
 
-def _validate_text(text: bytes) -> ReportDocument:
+def _validate_text(text: bytes, most_problems: int) -> ReportDocument:
+    if len(text) > _SHORT and has_more_values(text, MAX_VALUES):
+        message = f"the report has more than {MAX_VALUES} values; give at most {MAX_MEASUREMENTS} measurements"
+        raise InvalidReportError((FieldProblem(path=(), message=message),))
     try:
         return ReportDocument.model_validate_json(text)  # three times faster than by way of a dict
     except ValidationError:
-        return _validate(read_json(text))  # finds the same, and has the values for the messages
+        return _validate(read_json(text), most_problems)  # finds the same, and has the values for the messages
 
 
-def _validate(data: object) -> ReportDocument:
+def _validate(data: object, most_problems: int) -> ReportDocument:
+    document = dict(data) if isinstance(data, Mapping) else data
     try:
-        return ReportDocument.model_validate(dict(data) if isinstance(data, Mapping) else data)
+        return ReportDocument.model_validate(document)
     except ValidationError as error:
-        raise InvalidReportError(problems_of_validation(error)) from None
+        raise invalid_report(error, ReportDocument, document, report_problem_of, most_problems) from None

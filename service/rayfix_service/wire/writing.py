@@ -5,7 +5,6 @@ from typing import Any
 
 from rayfix_service.fusion.measurements.report import (
     CONFIDENCE,
-    GAUSSIAN,
     Angle,
     ErrorModel,
     LogRange,
@@ -15,13 +14,23 @@ from rayfix_service.fusion.measurements.report import (
     TimeDifference,
     TimeOfArrival,
 )
+from rayfix_service.wire.fields import METRES_PER_NANOSECOND
+from rayfix_service.wire.problems import FieldProblem, InvalidReportError
+from rayfix_service.wire.request import parse_report
+from rayfix_tables.angles import wrap_one
 
 
 def report_to_document(report: Report) -> dict[str, Any]:
     """Write a report as JSON-compatible data of which :func:`rayfix_service.wire.parse_report` makes it again.
 
-    Lengths are given as lengths, and a path length with a relative error as the signal strength of some model. What
-    has its default is left out.
+    Lengths are given as lengths unless their deviation is too small for it, then as times, and a path length with a
+    relative error as the signal strength of some model. Azimuths are written as they are within one turn. What has its
+    default is left out, and so is an error model that is Gaussian by its numbers.
+
+    Raises
+    ------
+    InvalidReportError
+        For a report that the document cannot carry: a value out of range, an identifier that is too long.
     """
     document: dict[str, Any] = {}
     if report.target_id is not None:
@@ -33,6 +42,7 @@ def report_to_document(report: Report) -> dict[str, Any]:
     if report.confidence != CONFIDENCE:
         document["confidence"] = report.confidence
     document["measurements"] = [_measurement(measurement) for measurement in report.measurements]
+    parse_report(document)
     return document
 
 
@@ -47,27 +57,74 @@ def _measurement(measurement: Measurement) -> dict[str, Any]:
                 "type": "tdoa",
                 "station_id": measurement.station_id,
                 "reference_station_id": measurement.reference_station_id,
-                "range_difference_m": measurement.length_difference,
+                **_length(
+                    "range_difference_m", "delay_difference_ns", measurement.length_difference, measurement.stdev
+                ),
             }
-        case Range() | TimeOfArrival():
+        case Range():
             document = {
-                "type": "pt" if isinstance(measurement, Range) else "toa",
+                "type": "pt",
                 "station_id": measurement.station_id,
-                "range_m": measurement.path_length,
                 **_sight(measurement),
+                **_range(measurement),
             }
-    return {**document, "stdev_m": measurement.stdev, **_error_model(measurement.error_model)}
+        case TimeOfArrival():
+            document = {
+                "type": "toa",
+                "station_id": measurement.station_id,
+                **_sight(measurement),
+                **_length("range_m", "delay_ns", measurement.path_length, measurement.stdev),
+            }
+    return document | _error_model(measurement.error_model)
+
+
+_LEAST = 1e-6
+"""Least standard deviation in whichever unit."""
+
+
+def _length(length_key: str, time_key: str, length: float, stdev: float) -> dict[str, float]:
+    """Write a length and its deviation, m; as a time, if the deviation is too small for a length."""
+    if not stdev < _LEAST:
+        return {length_key: length, "stdev_m": stdev}
+    return {
+        time_key: _toward_zero(length, METRES_PER_NANOSECOND),
+        "stdev_ns": _snapped(stdev / METRES_PER_NANOSECOND, _LEAST),
+    }
+
+
+def _range(measurement: Range) -> dict[str, float]:
+    """Write a range; as a round trip, whose deviation may be the smallest, if it is too small for a length."""
+    if not measurement.stdev < _LEAST:
+        return {"range_m": measurement.path_length, "stdev_m": measurement.stdev}
+    return {
+        "round_trip_ns": _toward_zero(measurement.path_length, 0.5 * METRES_PER_NANOSECOND),
+        "reply_ns": 0.0,
+        "stdev_ns": _snapped(measurement.stdev / (0.5 * METRES_PER_NANOSECOND), _LEAST),
+    }
+
+
+def _toward_zero(value: float, unit: float) -> float:
+    """Divide by a unit, so that the product with it is not beyond the value, which may be the largest allowed."""
+    quotient = value / unit
+    return math.nextafter(quotient, 0.0) if abs(quotient * unit) > abs(value) else quotient
+
+
+def _snapped(value: float, *limits: float) -> float:
+    """Return the limit from which a value differs in its last digits only, which may be beyond it."""
+    return next((limit for limit in limits if math.isclose(value, limit, rel_tol=1e-12)), value)
 
 
 def _angle(angle: Angle) -> dict[str, Any]:
     document: dict[str, Any] = {
         "type": "aoa",
         "station_id": angle.station_id,
-        "azimuth_deg": _degrees(angle.azimuth),
+        "azimuth_deg": _degrees(wrap_one(angle.azimuth) if math.isfinite(angle.azimuth) else angle.azimuth),
         "azimuth_stdev_deg": _degrees(angle.azimuth_stdev),
     }
-    if angle.zenith is not None and angle.zenith_stdev is not None:
-        document |= {"zenith_deg": _degrees(angle.zenith), "zenith_stdev_deg": _degrees(angle.zenith_stdev)}
+    if angle.zenith is not None:
+        document["zenith_deg"] = _degrees(angle.zenith)
+    if angle.zenith_stdev is not None:
+        document["zenith_stdev_deg"] = _degrees(angle.zenith_stdev)
     if angle.correlation:
         document["correlation"] = angle.correlation
     if angle.frame != "scene":
@@ -76,23 +133,31 @@ def _angle(angle: Angle) -> dict[str, Any]:
 
 
 def _signal_strength(measurement: LogRange) -> dict[str, Any]:
-    """Find a path-loss model of the same median and spread; exponent 2 unless the shadowing is then out of range."""
-    decibels = 10.0 / math.log(10.0)
-    shadowing = min(max(2.0 * decibels * measurement.log_stdev, 0.1), 15.0)
-    exponent = shadowing / (decibels * measurement.log_stdev)
-    loss = exponent * decibels * math.log(measurement.path_length)
+    """Find a path-loss model of the same median and spread; exponent 2 unless something is then out of range."""
+    length, log_stdev = measurement.path_length, measurement.log_stdev
+    if not (0.0 < length < math.inf and 0.0 < log_stdev < math.inf):
+        text = f"a signal strength is of a path of {length!r} m with a deviation of its logarithm of {log_stdev!r}"
+        raise InvalidReportError(
+            (FieldProblem(path=("measurements",), message=f"{text}; give positive finite numbers"),)
+        )
+    decibels = 10.0 / math.log(10.0)  # of a factor of e, for each unit of exponent
+    spread, loss = decibels * log_stdev, decibels * math.log(length)
+    # The shadowing is from 0.1 to 15 dB, powers are from -200 to 100 dBm, the exponent is from 0.5 to 10.
+    least = max(0.5, 0.1 / spread)
+    most = min(10.0, 15.0 / spread, 300.0 / abs(loss) if loss else math.inf)
+    exponent = min(max(2.0, least), most)
     return {
         "type": "rssi",
         "station_id": measurement.station_id,
-        "rssi_dbm": -50.0 - 0.5 * loss,
-        "power_at_1m_dbm": -50.0 + 0.5 * loss,
+        "rssi_dbm": _snapped(-50.0 - 0.5 * exponent * loss, -200.0, 100.0),
+        "power_at_1m_dbm": _snapped(-50.0 + 0.5 * exponent * loss, -200.0, 100.0),
         "path_loss_exponent": exponent,
-        "shadowing_stdev_db": shadowing,
+        "shadowing_stdev_db": _snapped(exponent * spread, 0.1, 15.0),
     }
 
 
 def _error_model(model: ErrorModel) -> dict[str, Any]:
-    if model == GAUSSIAN:
+    if model.tail_share == 0.0 or model.tail_scale == 1.0:
         return {}
     return {"error_model": "heavy_tailed", "tail_share": model.tail_share, "tail_scale": model.tail_scale}
 
@@ -103,4 +168,4 @@ def _sight(measurement: Angle | Range | TimeOfArrival) -> dict[str, Any]:
 
 def _degrees(radians: float) -> float:
     """Convert to degrees, without the last digits that the way through radians cost."""
-    return round(math.degrees(radians), 12)
+    return float(f"{math.degrees(radians):.14g}")

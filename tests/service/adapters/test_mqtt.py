@@ -8,19 +8,16 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import aiomqtt
 import pytest
 
 from rayfix.cli import main
 from rayfix_service.adapters.formats import write
-from rayfix_service.adapters.mqtt import Broker, BrokerError, MqttSettings, check_settings, parse_broker, run_mqtt
+from rayfix_service.adapters.mqtt import Broker, BrokerError, MqttSettings, check_settings, parse_broker
 from rayfix_service.adapters.omlox_hub import HubSettings
 from rayfix_service.adapters.silabs import parse_silabs
 from rayfix_service.adapters.silabs_stream import SilabsStream
@@ -28,6 +25,7 @@ from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Height
 from rayfix_service.http.openapi.examples import SILABS_EXAMPLES
 from rayfix_tables.table import Table
+from tests.support.mqtt_broker import Mosquitto, broker_in, exchange, locating
 
 MESSAGE: dict[str, Any] = SILABS_EXAMPLES["three_locators"]["value"]
 STATIONS: dict[str, str] = MESSAGE["stations"]
@@ -54,96 +52,10 @@ def locator(hall_table_path: Path) -> Locator:
     return locator
 
 
-@dataclass
-class Mosquitto:
-    """A broker on the loopback interface."""
-
-    program: str
-    folder: Path
-    port: int
-    process: subprocess.Popen[bytes] | None = None
-
-    def start(self, *options: str) -> None:
-        """Start it and wait until it listens."""
-        config = self.folder / "mosquitto.conf"
-        # Started by root, it would become a user that cannot read the test's folder; otherwise the line is ignored.
-        lines = [f"listener {self.port} 127.0.0.1", "user root", *(options or ["allow_anonymous true"])]
-        config.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        self.process = subprocess.Popen([self.program, "-c", str(config)], stderr=subprocess.DEVNULL)
-        deadline = time.monotonic() + 10
-        while True:
-            with suppress(OSError), socket.create_connection(("127.0.0.1", self.port), timeout=1):
-                return
-            assert time.monotonic() < deadline, "the broker does not listen"
-            time.sleep(0.02)
-
-    def stop(self) -> None:
-        """Stop it."""
-        if self.process is not None:
-            self.process.terminate()
-            self.process.wait(10)
-            self.process = None
-
-    @property
-    def address(self) -> Broker:
-        """Where it is."""
-        return Broker(host="127.0.0.1", port=self.port)
-
-
-def find_mosquitto() -> str:
-    """Return the broker's program; the test skips without it."""
-    program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
-    if program is None:
-        pytest.skip("the MQTT broker mosquitto is not installed (Debian: apt-get install mosquitto)")
-    return program
-
-
 @pytest.fixture
 def mosquitto(tmp_path: Path) -> Iterator[Mosquitto]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    broker = Mosquitto(program=find_mosquitto(), folder=tmp_path, port=port)
-    yield broker
-    broker.stop()
-
-
-@asynccontextmanager
-async def locating(locator: Locator, broker: Broker, settings: MqttSettings) -> AsyncIterator[asyncio.Queue[None]]:
-    """Locate in the background; yields a queue that fills each time that it is ready."""
-    ready: asyncio.Queue[None] = asyncio.Queue()
-    work = asyncio.create_task(run_mqtt(locator, broker, settings, on_ready=lambda: ready.put_nowait(None)))
-    getter = asyncio.create_task(ready.get())
-    await asyncio.wait([work, getter], return_when=asyncio.FIRST_COMPLETED)
-    getter.cancel()
-    try:
-        if work.done():
-            work.result()
-        yield ready
-    finally:
-        work.cancel()
-        with suppress(asyncio.CancelledError):
-            await work
-
-
-async def exchange(
-    broker: Broker, messages: list[tuple[str, Any]], *, answers: int, topic: str = "rayfix/position/#"
-) -> list[tuple[str, dict[str, Any]]]:
-    """Publish messages and wait for so many answers."""
-    async with aiomqtt.Client(
-        broker.host, port=broker.port, username=broker.username, password=broker.password
-    ) as client:
-        await client.subscribe(topic)
-        for to, payload in messages:
-            await client.publish(to, payload if isinstance(payload, bytes | None) else json.dumps(payload))
-        received = []
-        async with asyncio.timeout(20):
-            async for message in client.messages:
-                assert isinstance(message.payload, bytes)
-                received.append((message.topic.value, json.loads(message.payload)))
-                if len(received) == answers:
-                    return received
-    raise AssertionError("the broker ended the connection")
+    with broker_in(tmp_path) as broker:
+        yield broker
 
 
 def run(coroutine: Callable[[], Any]) -> Any:

@@ -136,5 +136,5 @@ def test_a_line_of_another_kind_is_refused():
 
 
 def test_too_many_reports_are_refused():
-    with pytest.raises(InvalidReportError, match="1001 reports; give at most 1000"):
+    with pytest.raises(InvalidReportError, match="more than 1000 reports; give at most 1000"):
         parse_ublox("\n".join([line("t", "a")] * 1001))

@@ -1,11 +1,12 @@
 """Locating within a request."""
 
+import asyncio
 import logging
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from time import perf_counter
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 from fastapi import Depends
 from pydantic_core import from_json, to_json
@@ -25,9 +26,15 @@ from rayfix_service.http.problems import ProblemError, internal_problem, problem
 from rayfix_service.http.telemetry.metrics import Metrics
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report, report_to_document
+from rayfix_service.wire.problems import MAX_PROBLEMS
 from rayfix_tables.errors import ReportError
 
 _log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+READ_AT_ONCE = 16 << 10
+"""Bytes of a body that is parsed right on the event loop, within some milliseconds whatever it holds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,15 +61,15 @@ class Incoming:
         return report_to_document(self.report) if self.document is None else self.document
 
 
-def native(document: Mapping[str, Any] | bytes) -> Incoming:
+def native(document: Mapping[str, Any] | bytes, *, most_problems: int = MAX_PROBLEMS) -> Incoming:
     """Read a report of this project's own format.
 
     Raises
     ------
     ReportError
-        When it cannot be used.
+        When it cannot be used; of its problems it lists at most so many.
     """
-    return Incoming(report=parse_report(document), document=document)
+    return Incoming(report=parse_report(document, most_problems=most_problems), document=document)
 
 
 def foreign(adapted: Adapted) -> Incoming:
@@ -80,12 +87,26 @@ class Located(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Answerer:
-    """What answers reports: the figures that it adds to, the feed and hub to tell, threads for slow ones."""
+    """What answers reports: figures to add to, the feed and hub to tell, threads for slow ones, the turn to read."""
 
     metrics: Metrics
     feed: FixFeed
     slow_fixes: SlowFixes
     hub: OmloxHub | None
+    reading: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    async def read(self, parse: Callable[[bytes], T], body: bytes) -> T:
+        """Parse a body: a long one in a thread, one at a time, so that others are answered meanwhile.
+
+        Raises
+        ------
+        Exception
+            As `parse` does.
+        """
+        if len(body) <= READ_AT_ONCE:
+            return parse(body)
+        async with self.reading:
+            return await asyncio.to_thread(parse, body)
 
     async def answer(self, table: ServedTable, incoming: Incoming, wanted: Wanted) -> dict[str, Any]:
         """Locate a report with a table and write the answer as wanted.
@@ -143,19 +164,26 @@ class Answerer:
         return write(fix, wanted.output, site, compute_seconds=seconds, adapted=incoming.adapted, track=track)
 
     async def answer_or_problem(
-        self, table: ServedTable, make: Callable[[], Incoming], wanted: Wanted
+        self, table: ServedTable, make: Callable[[], Incoming | Awaitable[Incoming]], wanted: Wanted
     ) -> dict[str, Any]:
         """Answer one report of several, with a problem where it cannot be used."""
         try:
-            return await self.answer(table, make(), wanted)
-        except ReportError as error:
+            made = make()
+            return await self.answer(table, made if isinstance(made, Incoming) else await made, wanted)
+        except Exception as error:
+            return problem_of(error)
+
+
+def problem_of(error: Exception) -> dict[str, Any]:
+    """Write the problem of one report of several."""
+    match error:
+        case ReportError():
             return report_problem(error)
-        except ProblemError as error:
+        case ProblemError():
             return problem_document(error.kind, str(error))
-        except Exception:
-            # A defect that one report meets must not cost the other 999 their fix.
-            _log.exception("a report of several failed")
-            return internal_problem()
+    # A defect that one report meets must not cost the other 999 their fix.
+    _log.error("a report of several failed", exc_info=error)
+    return internal_problem()
 
 
 def _event(table: str, incoming: Incoming, located: Located) -> bytes:

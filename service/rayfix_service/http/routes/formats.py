@@ -46,7 +46,8 @@ class LinesResult(BaseModel):
 )
 async def post_nrppa(answerer: AnswererDep, table: TableDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    return JsonAnswer(await answerer.answer(table, foreign(parse_nrppa(body)), wanted), media_type=wanted.media_type)
+    incoming = foreign(await answerer.read(parse_nrppa, body))
+    return JsonAnswer(await answerer.answer(table, incoming, wanted), media_type=wanted.media_type)
 
 
 @router.post(
@@ -58,7 +59,8 @@ async def post_nrppa(answerer: AnswererDep, table: TableDep, body: ReportBody, w
 )
 async def post_silabs(answerer: AnswererDep, table: TableDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    return JsonAnswer(await answerer.answer(table, foreign(parse_silabs(body)), wanted), media_type=wanted.media_type)
+    incoming = foreign(await answerer.read(parse_silabs, body))
+    return JsonAnswer(await answerer.answer(table, incoming, wanted), media_type=wanted.media_type)
 
 
 @router.post(
@@ -85,7 +87,7 @@ async def post_ublox(
 ) -> JsonAnswer:
     """Take ``+UUDF`` lines of u-blox anchors and join them by tag and sequence number."""
     known, results = known_height(height_m, height_stdev_m), []
-    messages = parse_ublox(body, stations=station_map(station))
+    messages = await answerer.read(partial(parse_ublox, stations=station_map(station)), body)
     charge_reports(request, len(messages))
     patience = Patience(request)
     for adapted in messages:

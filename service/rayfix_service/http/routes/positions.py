@@ -11,7 +11,7 @@ from starlette.types import Receive, Scope
 
 from rayfix_service.http.access.guard import charge_reports
 from rayfix_service.http.answering.cooperative import Patience
-from rayfix_service.http.answering.locating import Answerer, AnswererDep, native
+from rayfix_service.http.answering.locating import Answerer, AnswererDep, Incoming, native, problem_of
 from rayfix_service.http.answering.response_options import WantedDep, wanted_by
 from rayfix_service.http.openapi.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
 from rayfix_service.http.openapi.responses import NATIVE_ANSWER, POSITION_PROBLEMS, NativeOrOther, request_body
@@ -19,19 +19,16 @@ from rayfix_service.http.problems import Problem
 from rayfix_service.http.routes.dependencies import BatchBody, ReportBody, TableDep, read_body
 from rayfix_service.http.routes.json_answer import JsonAnswer, write_json
 from rayfix_service.http.settings import ServiceSettings
-from rayfix_service.wire import (
-    MAX_REPORTS,
-    BatchDocument,
-    FieldProblem,
-    InvalidReportError,
-    ReportDocument,
-    path_text,
-    read_json,
-)
+from rayfix_service.wire import BatchDocument, MalformedJsonError, ReportDocument
+from rayfix_service.wire.batches import split_batch
+from rayfix_service.wire.problems import MAX_PROBLEMS
 
 
 class BatchResult(BaseModel):
-    """The answers to a batch, in the order of its reports."""
+    """The answers to a batch, in the order of its reports.
+
+    All its problems together list some 50 fields; once they do, each further one lists its first and counts the others.
+    """
 
     results: list[NativeOrOther | Problem] = Field(
         description="a fix in the format that is wanted, or the problem of that report, whose paths start at the report"
@@ -50,7 +47,9 @@ router = APIRouter(prefix="/v1", tags=["positions"])
 )
 async def post_position(answerer: AnswererDep, table: TableDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
-    return JsonAnswer(await answerer.answer(table, native(body), wanted), media_type=wanted.media_type)
+    return JsonAnswer(
+        await answerer.answer(table, await answerer.read(native, body), wanted), media_type=wanted.media_type
+    )
 
 
 async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple[bytes, str]:
@@ -64,7 +63,7 @@ async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple
     table = state.tables.named(None)
     body = await read_body(scope, receive, settings.body_limits.report)
     wanted = wanted_by(scope, settings)
-    incoming = native(body)
+    incoming = await answerer.read(native, body)
     await asyncio.sleep(0)
     located = await answerer.locate(table, incoming, wanted)
     await asyncio.sleep(0)
@@ -82,36 +81,31 @@ async def post_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, wanted: WantedDep
 ) -> JsonAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
-    documents = _batch_reports(read_json(body))
-    charge_reports(request, len(documents))
-    results: list[dict[str, Any]] = []
+    texts = await answerer.read(split_batch, body)
+    charge_reports(request, len(texts))
     patience = Patience(request)
-    for document in documents:  # not by locate_batch: other batches keep the other workers, one for each core, as busy
+    reports: list[Incoming | dict[str, Any]] = []  # all, before the first is located: a batch is JSON or it is not
+    listed = 0
+    for number, text in enumerate(texts):
         await patience.take_a_breath()
-        results.append(await answerer.answer_or_problem(table, partial(native, document), wanted))
+        read = partial(native, most_problems=MAX_PROBLEMS if listed < MAX_PROBLEMS else 1)
+        try:
+            reports.append(await answerer.read(read, text))
+        except MalformedJsonError as error:
+            raise MalformedJsonError(f"reports[{number}]: {error}") from None
+        except Exception as error:
+            problem = problem_of(error)
+            reports.append(problem)
+            listed += len(problem["errors"])
+    results: list[dict[str, Any]] = []
+    for report in reports:  # not by locate_batch: other batches keep the other workers, one for each core, as busy
+        if isinstance(report, Incoming):
+            await patience.take_a_breath()
+            results.append(await answerer.answer_or_problem(table, partial(_itself, report), wanted))
+        else:
+            results.append(report)
     return JsonAnswer({"results": results})
 
 
-def _batch_reports(document: object) -> list[Any]:
-    """Return the reports of a batch, whatever they are.
-
-    Raises
-    ------
-    InvalidReportError
-        When the document is not a batch.
-    """
-    path: tuple[str | int, ...] = ()
-    if not isinstance(document, dict):
-        text = 'the batch is no JSON object; give {"reports": [...]}'
-    elif unknown := [key for key in document if key != "reports"]:
-        path = (unknown[0],)
-        text = f"{path_text(path)} is an unknown key; a batch has the key reports alone"
-    elif not isinstance(document.get("reports"), list):
-        path = ("reports",)
-        text = "reports is missing or no array; give an array of reports"
-    elif len(document["reports"]) > MAX_REPORTS:
-        path = ("reports",)
-        text = f"reports is an array of length {len(document['reports'])}; give at most {MAX_REPORTS} at once"
-    else:
-        return list(document["reports"])
-    raise InvalidReportError((FieldProblem(path=path, message=text),))
+def _itself(report: Incoming) -> Incoming:
+    return report

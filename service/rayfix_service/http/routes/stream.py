@@ -201,7 +201,7 @@ async def _answer(tables: Tables, table: str | None, answerer: Answerer, body: b
         served = tables.named(table)
     except ProblemError as error:
         return problem_document(error.kind, str(error), error.errors)
-    return await answerer.answer_or_problem(served, partial(native, body), wanted)
+    return await answerer.answer_or_problem(served, partial(answerer.read, native, body), wanted)
 
 
 async def _next_message(websocket: WebSocket) -> bytes:

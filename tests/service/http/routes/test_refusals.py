@@ -127,7 +127,7 @@ def test_all_problems_of_a_report_are_listed(hall_app: RunningApp):
         (b"{}", 422, "reports", ["missing", "array of reports"]),
         (b'{"reports": {}}', 422, "reports", ["no array"]),
         (b'{"reports": [], "report": 1}', 422, "report", ["unknown key", "reports"]),
-        (json.dumps({"reports": [0] * 1001}).encode(), 422, "reports", ["length 1001", "at most 1000"]),
+        (json.dumps({"reports": [0] * 1001}).encode(), 422, "reports", ["more than 1000", "at most 1000"]),
     ],
 )
 def test_what_is_no_batch_is_refused(hall_app: RunningApp, body: bytes, status: int, path: str, words: list[str]):
