@@ -36,6 +36,11 @@ def report_rate(text: str) -> float:
     )
 
 
+def positive(text: str) -> float:
+    """Read a limit."""
+    return _number(text, float, lambda limit: 0.0 < limit < 1e9, "is no limit; give a number above 0, e.g. 10")
+
+
 def drop_count(text: str) -> int:
     """Read a number of drops; fewer than two have no percentiles."""
     return _number(text, int, lambda drops: drops >= 2, "is no number of drops; give 2 or more")

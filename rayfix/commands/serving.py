@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rayfix.commands.arguments import AddCommand, add_hub_argument, hub_settings, report_rate, web_origin
+from rayfix.commands.arguments import AddCommand, add_hub_argument, hub_settings, positive, report_rate, web_origin
 from rayfix.extras import needs_extra
 
 
@@ -40,6 +40,20 @@ def add_commands(add: AddCommand) -> None:
         metavar="ORIGIN",
         help="let pages of this origin, e.g. https://maps.example.com, call from browsers; may be given several times",
     )
+    serve.add_argument(
+        "--check-seconds",
+        type=positive,
+        default=10.0,
+        metavar="S",
+        help="processor time that the check of a table may take, besides 60 s for each GB of it (default: 10)",
+    )
+    serve.add_argument(
+        "--check-memory-mb",
+        type=positive,
+        default=256.0,
+        metavar="MB",
+        help="memory that the check of a table may take, besides three times its size (default: 256)",
+    )
 
     api_key = add("api-key", _api_key, "make an API key, print it once, and add its hash to a key file")
     api_key.add_argument("name", metavar="NAME", help="whose it is")
@@ -50,6 +64,8 @@ def _serve(options: argparse.Namespace) -> int:
     with needs_extra("service"):
         from rayfix_service.http.server import is_loopback, serve
         from rayfix_service.http.settings import ServiceSettings
+    from rayfix_tables.checked import CheckLimits
+
     serve(
         options.tables,
         host=options.host,
@@ -63,6 +79,7 @@ def _serve(options: argparse.Namespace) -> int:
             cors_origins=tuple(options.cors_origin),
             track=options.track,
             hub=hub_settings(options),
+            table_check=CheckLimits(seconds=options.check_seconds, memory=round(options.check_memory_mb * 1e6)),
             simulation=options.allow_simulation or is_loopback(options.host),
         ),
     )

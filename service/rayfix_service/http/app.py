@@ -33,6 +33,7 @@ from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.short_way import ShortWay
 from rayfix_service.http.slow_fixes import SlowFixes
 from rayfix_service.http.stopping import on_stop_signal
+from rayfix_service.http.table_checks import TableChecks
 from rayfix_service.http.tables import ServedTable, Tables
 from rayfix_service.web import routes_assets, routes_scene, routes_simulation
 from rayfix_service.web.documents import SimulationRequest
@@ -124,7 +125,11 @@ def create_app(
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         state = app.state
         state.tables = tables = Tables(
-            tables_path, state.metrics, runtime_folder=settings.runtime_folder, at_hand=at_hand
+            tables_path,
+            state.metrics,
+            runtime_folder=settings.runtime_folder,
+            at_hand=at_hand,
+            checks=TableChecks(settings.runtime_folder, settings.table_check),
         )
         keeping = [asyncio.create_task(tables.keep(settings.watch_seconds))]
         if keys is not None:

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import NamedTemporaryFile, TemporaryDirectory
+from tempfile import NamedTemporaryFile
 
 import uvicorn
 
@@ -23,9 +23,11 @@ from rayfix_service.http.logs import LogFormat, log_config
 from rayfix_service.http.metrics import MULTIPROCESS_VARIABLE, share_figures
 from rayfix_service.http.protocol import GatheringProtocol
 from rayfix_service.http.rates import Accounts
+from rayfix_service.http.runtime_folder import runtime_folder
 from rayfix_service.http.settings import ServiceSettings
-from rayfix_service.http.tables import forget_changed, load_tables
-from rayfix_service.http.workers import COULD_NOT_START, run_workers
+from rayfix_service.http.table_checks import TableChecks
+from rayfix_service.http.tables import follow_changes, load_tables
+from rayfix_service.http.workers import COULD_NOT_START, run_workers, tell_failure, tell_started
 from rayfix_tables.errors import RayfixError
 
 _MAX_MESSAGE = 16 << 20  # bytes; up to here a message that is too long is answered, beyond it ends the connection
@@ -72,10 +74,10 @@ def serve(
     Raises
     ------
     TableError
-        When a table is missing, of another format, or damaged.
+        When no table is whole: missing, of another format, or damaged. Where others are whole, these are served.
     ServiceError
-        When the port is taken, an argument is out of range, the keys are missing, or the folder for figures cannot be
-        written to.
+        When no worker can start, the port is taken, an argument is out of range, the keys are missing, or the folder
+        for figures cannot be written to.
     """
     path = Path(tables_path).absolute()
     settings = replace(settings or ServiceSettings(), own_process=True)
@@ -94,7 +96,8 @@ def serve(
             settings = replace(settings, runtime_folder=stack.enter_context(_runtime_folder()))
         if MULTIPROCESS_VARIABLE in os.environ:
             _check_room(Path(os.environ[MULTIPROCESS_VARIABLE]))
-        at_hand = load_tables(path)
+        checks = TableChecks(settings.runtime_folder, settings.table_check)
+        at_hand = load_tables(path, checks=checks)
         config = uvicorn.Config(
             partial(create_app, path, settings, at_hand=at_hand, accounts=Accounts()),
             factory=True,
@@ -120,7 +123,7 @@ def serve(
             run_workers(
                 partial(_work, config, bound),
                 count=workers,
-                meanwhile=partial(forget_changed, at_hand),
+                meanwhile=partial(follow_changes, at_hand, path, checks, failed=set()),
                 ending=bound.close,  # or the system would take connections that nobody answers
             )
 
@@ -131,7 +134,7 @@ def _work(config: uvicorn.Config, bound: socket.socket) -> None:
     try:
         _run(config, bound)
     except RayfixError as error:
-        _log.critical("a worker cannot start: %s", error)
+        tell_failure(str(error))
         sys.exit(COULD_NOT_START)
 
 
@@ -149,6 +152,12 @@ class _Server(uvicorn.Server):
     Such a request may wait in a connection that is not yet accepted or read, and uvicorn would close that.
     """
 
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start to listen."""
+        await super().startup(sockets)
+        if self.started:
+            tell_started()
+
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Take what has arrived, then stop listening and finish what is under way."""
         await asyncio.sleep(_ARRIVING_SECONDS)
@@ -158,19 +167,19 @@ class _Server(uvicorn.Server):
 @contextmanager
 def _runtime_folder() -> Iterator[Path]:
     """Make the folder that workers share, with a place for their figures unless the environment names one."""
-    try:
-        folder = TemporaryDirectory(prefix="rayfix-")
-    except OSError as error:
-        raise ServiceError(
-            f"the workers need a temporary folder and there is none ({error.strerror}); set TMPDIR to one"
-        ) from None
-    with folder as name, ExitStack() as stack:
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(runtime_folder())
+        except OSError as error:
+            raise ServiceError(
+                f"the workers need a temporary folder and there is none ({error.strerror}); set TMPDIR to one"
+            ) from None
         if MULTIPROCESS_VARIABLE not in os.environ:
             # Whichever worker is asked answers for all.
-            (Path(name) / "metrics").mkdir()
-            os.environ[MULTIPROCESS_VARIABLE] = str(Path(name) / "metrics")
+            (folder / "metrics").mkdir()
+            os.environ[MULTIPROCESS_VARIABLE] = str(folder / "metrics")
             stack.callback(os.environ.pop, MULTIPROCESS_VARIABLE)
-        yield Path(name)
+        yield folder
 
 
 def _check_room(folder: Path) -> None:
