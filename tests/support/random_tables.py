@@ -57,7 +57,7 @@ def random_content(
                 ),
             )
         )
-        levels = []
+        levels: list[Level] = []
         for window in 0.3 * 2.0 ** np.arange(num_levels):
             grid = AngularGrid.from_spacing(window / 0.8)
             counts = rng.integers(0, max_components + 1, grid.num_cells)
