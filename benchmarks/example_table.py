@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rayfix.example.files import write_example
 from rayfix_offline.build import build_table
+from rayfix_tables.checked import open_checked
 from rayfix_tables.table import Table
 
 
@@ -29,7 +30,7 @@ def open_or_build(path: Path | None) -> Iterator[Table]:
         When the table cannot be opened.
     """
     if path is not None:
-        yield Table.open(path)
+        yield open_checked(path)
         return
     with tempfile.TemporaryDirectory() as folder:
         print("building the hall's table ...", flush=True)

@@ -9,8 +9,8 @@ from rayfix_service.adapters.adapted import check_stations, error_in_message
 from rayfix_service.adapters.formats import InputFormat, OutputFormat, parse, write
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Height
+from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import ReportError
-from rayfix_tables.table import Table
 
 
 def locate_file(
@@ -47,7 +47,7 @@ def locate_file(
         body = report_path.read_bytes()
     except OSError as error:
         raise ReportError(f"{report_path} cannot be read ({error.strerror}); give a file with a report") from error
-    table = Table.open(table_path)
+    table = open_checked(table_path)
     check_stations(stations or {}, table.parts)
     locator = Locator(table)
     answers = []

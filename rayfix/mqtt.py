@@ -8,7 +8,7 @@ from pathlib import Path
 from rayfix_service.adapters.adapted import check_stations
 from rayfix_service.adapters.mqtt import Broker, MqttSettings, check_settings, run_mqtt
 from rayfix_service.fusion.locator import Locator
-from rayfix_tables.table import Table
+from rayfix_tables.checked import open_checked
 
 _log = logging.getLogger(__name__)
 
@@ -27,10 +27,9 @@ def serve_mqtt(table_path: Path, broker: Broker, settings: MqttSettings) -> None
     """
     logging.basicConfig(level=logging.INFO, format="%(levelname)s: %(message)s")
     check_settings(settings)
-    table = Table.open(table_path)
+    table = open_checked(table_path)
     check_stations(settings.stations, table.parts)
     _log.info("loading %s; the first start after an installation compiles kernels, which takes a minute", table_path)
-    table.verify()
     locator = Locator(table)
     locator.warm_up()
     asyncio.run(_until_told(locator, broker, settings))

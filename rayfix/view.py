@@ -16,6 +16,7 @@ from rayfix_service.web.glb import write_glb
 from rayfix_service.web.viewer_settings import picture_posterior, viewer_settings
 from rayfix_service.wire import InvalidReportError, fix_to_document, parse_report, read_json
 from rayfix_service.wire.table import station_summary, table_summary
+from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import RayfixError, ReportError
 from rayfix_tables.table import Table
 
@@ -53,7 +54,7 @@ def write_view(table_path: Path, output: Path, report_path: Path | None = None) 
     """
     if output.suffix.lower() not in _PAGES:
         raise ViewError(f"{output} is no name of a page; end it in {_PAGES[0]}")
-    table = Table.open(table_path)
+    table = open_checked(table_path)
     locator = Locator(table)
     if report_path is not None:
         locator.warm_up()  # else the first fix would tell how long compiling takes

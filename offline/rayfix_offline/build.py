@@ -7,7 +7,7 @@ where it was; stations and cells of a former table that are still right are take
 import resource
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -132,14 +132,45 @@ def build_table(
     twin = prepare_twin(site, site_path.parent)
     refuse_errors(twin)
     plans = plan_build(site, twin)
-    job = Job(
-        site=site,
-        twin=twin,
-        store=ShardStore.beside(table_path),
-        jobs=jobs,
-        former=read_former(Path(former) if former is not None else table_path, required=former is not None),
-        tolerance=tolerance,
+    refused: list[str] = []
+    former_table = read_former(
+        Path(former) if former is not None else table_path, required=former is not None, refused=refused.append
     )
+    with closing(ShardStore.beside(table_path)) as store:
+        job = Job(site=site, twin=twin, store=store, jobs=jobs, former=former_table, tolerance=tolerance)
+        built = _build_stations(plans, job, cluster, report)
+        contents = [station.content for station in built]
+        if not any(len(level.mixture) for content in contents for level in content.levels):
+            raise BuildError("no ray of any station finds free space; check the stations' positions and fields of view")
+        total = sum(plan.num_cells for plan in plans)
+        report("writing", total, total)
+        table_id = write_table(
+            table_path,
+            site=site.info(),
+            scene=_scene_content(twin),
+            stations=contents,
+            software_version=software_version(),
+        )
+        store.remove()
+    return BuildSummary(
+        path=table_path,
+        table_id=table_id,
+        seconds=time.perf_counter() - begin,
+        num_bytes=table_path.stat().st_size,
+        peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        stations=tuple(_summary(plan.station.id, station) for plan, station in zip(plans, built, strict=True)),
+        warnings=(
+            *refused,
+            *(finding.message for finding in twin.findings),
+            *_lost_ray_warnings(plans, contents, twin),
+        ),
+    )
+
+
+def _build_stations(
+    plans: tuple[StationPlan, ...], job: Job, cluster: str | None, report: Progress
+) -> list[BuiltStation]:
+    """Take over or build the parts of all stations, and balance them."""
     total = sum(plan.num_cells for plan in plans)
     done = 0
     built: list[BuiltStation] = []
@@ -149,33 +180,12 @@ def build_table(
             station = keep_station(plan, job)
             if station is None:
                 if cluster is not None and remote is None:
-                    remote = stack.enter_context(_connect(cluster, site, twin))
+                    remote = stack.enter_context(_connect(cluster, job.site, job.twin))
                 station = build_station(plan, job, remote, _after(done, total, report))
             built.append(station)
             done += plan.num_cells
     report("balancing", done, total)
-    built = _balanced(built, site, twin, jobs)
-    contents = [station.content for station in built]
-    if not any(len(level.mixture) for content in contents for level in content.levels):
-        raise BuildError("no ray of any station finds free space; check the stations' positions and fields of view")
-    report("writing", done, total)
-    table_id = write_table(
-        table_path,
-        site=site.info(),
-        scene=_scene_content(twin),
-        stations=contents,
-        software_version=software_version(),
-    )
-    job.store.remove()
-    return BuildSummary(
-        path=table_path,
-        table_id=table_id,
-        seconds=time.perf_counter() - begin,
-        num_bytes=table_path.stat().st_size,
-        peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-        stations=tuple(_summary(plan.station.id, station) for plan, station in zip(plans, built, strict=True)),
-        warnings=(*(finding.message for finding in twin.findings), *_lost_ray_warnings(plans, contents, twin)),
-    )
+    return _balanced(built, job.site, job.twin, job.jobs)
 
 
 def _balanced(stations: list[BuiltStation], site: SiteFile, twin: Twin, jobs: int) -> list[BuiltStation]:

@@ -36,6 +36,11 @@ def report_rate(text: str) -> float:
     )
 
 
+def positive(text: str) -> float:
+    """Read a limit."""
+    return _number(text, float, lambda limit: 0.0 < limit < 1e9, "is no limit; give a number above 0, e.g. 10")
+
+
 def drop_count(text: str) -> int:
     """Read a number of drops; fewer than two have no percentiles."""
     return _number(text, int, lambda drops: drops >= 2, "is no number of drops; give 2 or more")
@@ -59,11 +64,6 @@ def coordinate(text: str) -> float:
 def at_least_one(text: str) -> int:
     """Read a whole number from 1 on."""
     return _number(text, int, lambda number: 1 <= number < 1 << 31, "is no whole number from 1 on")
-
-
-def positive_seconds(text: str) -> float:
-    """Read a time limit."""
-    return _number(text, float, lambda seconds: 0.0 < seconds < 1e6, "is no time; give seconds, e.g. 10")
 
 
 def web_origin(text: str) -> str:

@@ -82,9 +82,9 @@ def _build(options: argparse.Namespace) -> int:
 
 def _info(options: argparse.Namespace) -> int:
     from rayfix.console import print_table_info, table_info
-    from rayfix_tables.table import Table
+    from rayfix_tables.checked import open_checked
 
-    table = Table.open(options.table)
+    table = open_checked(options.table, whole=False)
     if options.json:
         print(json.dumps(table_info(table), indent=2))
     else:
@@ -93,9 +93,8 @@ def _info(options: argparse.Namespace) -> int:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from rayfix_tables.table import Table
+    from rayfix_tables.checked import open_checked
 
-    table = Table.open(options.table)
-    table.verify()
+    table = open_checked(options.table)
     print(f"{options.table} is whole: table_id {table.table_id}")
     return 0

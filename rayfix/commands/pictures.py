@@ -56,10 +56,10 @@ def _plot(options: argparse.Namespace) -> int:
         from rayfix_evaluation.pictures.report_plot import plot_report
         from rayfix_service.fusion.locator import Locator
         from rayfix_service.wire import fix_to_document, parse_report
+        from rayfix_tables.checked import open_checked
         from rayfix_tables.errors import ReportError
-        from rayfix_tables.table import Table
     check_picture(options.output)
-    locator = Locator(Table.open(options.table))
+    locator = Locator(open_checked(options.table))
     documents = read_reports(options.report)
     if len(documents) != 1:
         raise ReportError(f"{options.report} has {len(documents)} reports; give a file with one")

@@ -8,7 +8,7 @@ from rayfix.commands.arguments import (
     add_hub_argument,
     at_least_one,
     hub_settings,
-    positive_seconds,
+    positive,
     report_rate,
     web_origin,
 )
@@ -56,6 +56,20 @@ def add_commands(add: AddCommand) -> None:
         help="a name by which a service without keys may be called besides localhost, e.g. that of a proxy before it; "
         "may be given several times",
     )
+    serve.add_argument(
+        "--check-seconds",
+        type=positive,
+        default=10.0,
+        metavar="S",
+        help="processor time that the check of a table may take, besides 60 s for each GB of it (default: 10)",
+    )
+    serve.add_argument(
+        "--check-memory-mb",
+        type=positive,
+        default=256.0,
+        metavar="MB",
+        help="memory that the check of a table may take, besides three times its size (default: 256)",
+    )
     _add_limit_arguments(serve)
 
     api_key = add("api-key", _api_key, "make an API key, print it once, and add its hash to a key file")
@@ -83,7 +97,7 @@ def _add_limit_arguments(command: argparse.ArgumentParser) -> None:
         ("unread-seconds", 30.0, "time that a client may leave an answer unread"),
     ):
         limits.add_argument(
-            f"--{name}", type=positive_seconds, default=seconds, metavar="S", help=f"{text} (default: {seconds:g})"
+            f"--{name}", type=positive, default=seconds, metavar="S", help=f"{text} (default: {seconds:g})"
         )
 
 
@@ -91,6 +105,8 @@ def _serve(options: argparse.Namespace) -> int:
     with needs_extra("service"):
         from rayfix_service.http.settings import ConnectionLimits, FeedLimits, ServiceSettings
         from rayfix_service.server.server import is_loopback, serve
+    from rayfix_tables.checked import CheckLimits
+
     serve(
         options.tables,
         host=options.host,
@@ -115,6 +131,7 @@ def _serve(options: argparse.Namespace) -> int:
             feed_limits=FeedLimits(listeners=options.listeners, backlog_bytes=options.backlog_kib << 10),
             track=options.track,
             hub=hub_settings(options),
+            table_check=CheckLimits(seconds=options.check_seconds, memory=round(options.check_memory_mb * 1e6)),
             simulation=options.allow_simulation or is_loopback(options.host),
         ),
     )

@@ -20,8 +20,8 @@ from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.wire import parse_report
+from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import RayfixError, ReportError, TableError
-from rayfix_tables.table import Table
 
 _BLOCK = 64
 """Reports that a process takes at a time; no more than these are not worth another process."""
@@ -94,7 +94,7 @@ def _locate_elsewhere(path: Path, table_id: str, settings: FusionSettings, packe
 @lru_cache(maxsize=4)
 def _locator(path: Path, table_id: str, settings: FusionSettings) -> Locator:
     """Give this process's locator for a table."""
-    table = Table.open(path)
+    table = open_checked(path, whole=False)
     if table.table_id != table_id:
         raise TableError(f"{path} has become another table since it was opened; open it again")
     return Locator(table, settings)

@@ -1,38 +1,34 @@
 """Read table files. The arrays are mapped, not read: workers that serve one table share its pages."""
 
 import json
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError, TableError
+from rayfix_tables.disk.files import open_table_file
+from rayfix_tables.disk.layout import FileLayout, damage_reported, read_layout
+from rayfix_tables.disk.schema import (
+    LEVEL_DATASETS,
+    SCENE_DATASETS,
+    array_digest,
+    content_id,
+    content_of,
+    level_path,
+    read_bias,
+)
+from rayfix_tables.disk.values import check_finite, check_offsets, check_range, check_rings
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import UNBALANCED, Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
-from rayfix_tables.schema import (
-    CELL_CHANGE,
-    FORMAT,
-    FORMAT_VERSION,
-    LEVEL_DATASETS,
-    LOG_BALANCE,
-    SCENE_DATASETS,
-    array_digest,
-    content_attributes,
-    content_id,
-    dataset_paths,
-    level_path,
-    read_bias,
-)
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.update import Update
+
+Attributes = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +63,8 @@ class Table:
     ----------
     parts : dict of str to StationPart
         By station identifier, in the site's order.
+    attributes : mapping
+        Attributes of the file's objects, by path: with the arrays, what the ``table_id`` is made of.
     """
 
     path: Path
@@ -76,6 +74,7 @@ class Table:
     site: SiteInfo
     scene: Scene
     parts: dict[str, StationPart]
+    attributes: Attributes = field(default_factory=dict, repr=False, compare=False)
 
     def __repr__(self) -> str:
         """Name the table; its arrays would fill the screen."""
@@ -85,7 +84,10 @@ class Table:
     def open(cls, path: str | Path) -> "Table":
         """Map a table file.
 
-        Checks the format and that the file is whole; :meth:`verify` also reads every byte.
+        Checks the format, that the file is whole, and that its numbers can be computed with; :meth:`verify` also
+        compares the checksums. HDF5 reads the file in this process, which a damaged one can crash or hold for ever:
+        for a file from elsewhere take :func:`rayfix_tables.checked.open_checked`, which has it checked in a process of
+        its own.
 
         Raises
         ------
@@ -99,195 +101,223 @@ class Table:
             When it is truncated or a part is missing.
         """
         path = Path(path)
-        with _damage_reported(path), _open_file(path) as file:
-            return cls._read(path, file, np.memmap(path, dtype=np.uint8, mode="r"))
+        with open_table_file(path) as opened, damage_reported(path):
+            table = cls.of_layout(path, read_layout(opened), opened.mapped())
+            check_finite(table.arrays())
+            return table
 
     @classmethod
-    def _read(cls, path: Path, file: h5py.File, mapped: NDArray[np.uint8]) -> "Table":
-        site_document = json.loads(file.attrs["site"])
+    def of_layout(cls, path: Path, layout: FileLayout, mapped: NDArray[np.uint8]) -> "Table":
+        """Make the table of a mapped file whose layout is known, without HDF5. Call it within ``damage_reported``.
+
+        Raises
+        ------
+        LookupError, TypeError, ValueError
+            When a part is missing or does not fit the others.
+        """
+        root = layout.attributes[""]
+        site_document = json.loads(_text(root["site"]))
+        station_ids = site_document["station_ids"]
+        _check_members(layout, station_ids)
         stations: list[Station] = []
         parts: dict[str, StationPart] = {}
-        for station_id in site_document["station_ids"]:
-            group = file[f"stations/{station_id}"]
+        for station_id in station_ids:
+            attributes = layout.attributes[f"stations/{station_id}"]
             station = Station(
                 id=station_id,
-                position=_triple(group.attrs["position_m"]),
-                orientation=_triple(np.deg2rad(group.attrs["orientation_deg"])),
-                field_of_view=float(np.deg2rad(group.attrs["field_of_view_deg"])),
-                bias=read_bias(group.attrs),
+                position=_triple(attributes["position_m"]),
+                orientation=_triple(np.deg2rad(attributes["orientation_deg"])),
+                field_of_view=float(np.deg2rad(attributes["field_of_view_deg"])),
+                bias=read_bias(attributes),
             )
-            levels = tuple(_read_level(file[level_path(station_id, n)], mapped) for n in range(len(group["levels"])))
+            levels = tuple(_read_level(path, layout, mapped) for path in _level_paths(layout, station_id))
             stations.append(station)
             parts[station_id] = StationPart(
                 station=station,
                 levels=levels,
-                lost_ray_share=float(group.attrs["lost_ray_share"]),
-                coverage=tuple(float(share) for share in group.attrs["coverage"]),
-                part_id=str(group.attrs["part_id"]),
-                update=_read_update(group, levels, mapped),
+                lost_ray_share=float(attributes["lost_ray_share"]),
+                coverage=tuple(float(share) for share in attributes["coverage"]),
+                part_id=_text(attributes["part_id"]),
+                update=_read_update(station_id, layout, levels, mapped),
             )
         return cls(
             path=path,
-            table_id=str(file.attrs["table_id"]),
-            format_version=int(file.attrs["format_version"]),
-            software_version=str(file.attrs["software_version"]),
+            table_id=_text(root["table_id"]),
+            format_version=int(root["format_version"]),
+            software_version=_text(root["software_version"]),
             site=SiteInfo(
-                name=site_document["name"],
-                north=float(np.deg2rad(site_document["north_deg"])),
-                max_path_length=float(site_document["max_path_length_m"]),
+                name=_text(site_document["name"]),
+                north=_finite(np.deg2rad(site_document["north_deg"])),
+                max_path_length=_finite(site_document["max_path_length_m"]),
                 stations=tuple(stations),
                 document=site_document["document"],
             ),
-            scene=_read_scene(file, mapped),
+            scene=_read_scene(layout, mapped),
             parts=parts,
+            attributes=layout.attributes,
         )
 
     def levels(self, station_id: str) -> tuple[Level, ...]:
         """Levels of a station, finest first."""
         return self.parts[station_id].levels
 
+    def arrays(self) -> Iterator[tuple[str, NDArray[Any]]]:
+        """Arrays of the table as they are in the file, by the paths of their datasets."""
+        scene = self.scene
+        yield "scene/vertices_m", scene.vertices
+        yield "scene/faces", scene.faces
+        yield "scene/face_materials", scene.face_materials
+        yield "scene/free_space", scene.free_space.free.view(np.uint8)
+        for station_id, part in self.parts.items():
+            for n, level in enumerate(part.levels):
+                path = level_path(station_id, n)
+                yield f"{path}/ring_cells", level.grid.ring_cells
+                yield f"{path}/cell_offsets", level.cell_offsets
+                yield f"{path}/cell_log_mass", level.cell_log_mass
+                for name in FIELD_SHAPES:
+                    yield f"{path}/{name}", getattr(level.mixture, name)
+                if f"{path}/log_balance" in self.attributes:
+                    yield f"{path}/log_balance", level.log_balance
+                if part.update is not None:
+                    yield f"{path}/cell_change", part.update.cell_change[n]
+
     def verify(self) -> None:
-        """Read every byte and compare the checksums.
+        """Read every byte and compare the checksums, in the file as it was opened.
 
         Raises
         ------
         CorruptTableError
             When a dataset or the ``table_id`` does not match.
         """
-        with _damage_reported(self.path), _open_file(self.path) as file:
+        with damage_reported(self.path):
             digests: dict[str, str] = {}
-            for name in dataset_paths(file):
-                digests[name] = array_digest(file[name][()])
-                if digests[name] != str(file[name].attrs.get("sha256")):
+            for name, array in self.arrays():
+                digests[name] = array_digest(array)
+                if digests[name] != self.attributes[name].get("sha256"):
                     raise ValueError(f"the checksum of {name} does not match")
-            if content_id(content_attributes(file), digests) != str(file.attrs["table_id"]):
+            if content_id(content_of(self.attributes), digests) != self.table_id:
                 raise ValueError("the table_id does not match the content")
+            check_finite(self.arrays())
 
 
-@contextmanager
-def _damage_reported(path: Path) -> Iterator[None]:
-    """Say in one line what the readers make of a damaged file.
-
-    A byte changed among the file's own administration shows as any of these: HDF5 raises OSError, KeyError or
-    RuntimeError, and what it reads nevertheless may have any type.
-    """
-    try:
-        yield
-    except (
-        ArithmeticError,
-        AttributeError,
-        LookupError,
-        MemoryError,
-        OSError,
-        RuntimeError,
-        TypeError,
-        ValueError,
-    ) as error:
-        raise CorruptTableError(
-            f"{path} is damaged: {_one_line(error)}; restore it from a copy or build it again"
-        ) from error
+def _check_members(layout: FileLayout, station_ids: Any) -> None:
+    """Check that the file has the stations that the site names, and no other group or dataset than theirs."""
+    if not isinstance(station_ids, list) or not station_ids or len(set(station_ids)) < len(station_ids):
+        raise ValueError("station_ids are no list of different stations")
+    known = {f"stations/{station_id}" for station_id in station_ids}
+    for path in layout.attributes:
+        station = "/".join(path.split("/")[:2])
+        if path.startswith("stations/") and station not in known:
+            raise ValueError(f"{station} is no station of the site")
 
 
-def _open_file(path: Path) -> h5py.File:
-    try:
-        missing = not path.exists()
-    except PermissionError:  # of a folder on the way
-        missing = False
-    if missing:
-        raise TableError(f"there is no table at {path}; build one with 'rayfix build SITE.toml -o {path}'")
-    if not os.access(path, os.R_OK):
-        raise TableError(f"{path} cannot be read; ask its owner for the right to read it")
-    if path.is_dir() or not h5py.is_hdf5(path):
-        raise NotATableError(f"{path} is not a rayfix table (not an HDF5 file); give a file that 'rayfix build' wrote")
-    file = h5py.File(path, "r")
-    if file.attrs.get("format") != FORMAT:
-        file.close()
-        raise NotATableError(f"{path} is an HDF5 file but not a rayfix table; give a file that 'rayfix build' wrote")
-    version = file.attrs.get("format_version")
-    if version != FORMAT_VERSION:
-        file.close()
-        raise FormatVersionError(
-            f"{path} has table format {version}, this rayfix reads format {FORMAT_VERSION}; build the table again "
-            "with this version, or install the version that wrote it"
-        )
-    return file
+def _level_paths(layout: FileLayout, station_id: str) -> list[str]:
+    """Paths of a station's levels, finest first."""
+    group = f"stations/{station_id}/levels/"
+    count = sum(path.startswith(group) and "/" not in path.removeprefix(group) for path in layout.attributes)
+    if not count:
+        raise ValueError(f"stations/{station_id} has no level")
+    return [level_path(station_id, n) for n in range(count)]
 
 
-def _map(dataset: h5py.Dataset, kind: tuple[type[np.generic], int], mapped: NDArray[np.uint8]) -> NDArray[Any]:
-    """View of a contiguous dataset in the mapped file."""
-    dtype, ndim = np.dtype(kind[0]), kind[1]
-    if dataset.dtype != dtype or dataset.ndim != ndim:
-        raise ValueError(f"{dataset.name} is {dataset.dtype} with {dataset.ndim} axes, not {dtype} with {ndim}")
-    if dataset.size == 0:
-        return np.zeros(dataset.shape, dtype)
-    offset = dataset.id.get_offset()
-    if offset is None or offset + dataset.nbytes > mapped.size:
-        raise ValueError(f"{dataset.name} is not whole")
-    raw = mapped[offset : offset + dataset.nbytes]
-    return raw.view(np.ndarray).view(dtype).reshape(dataset.shape)
-
-
-def _read_level(group: h5py.Group, mapped: NDArray[np.uint8]) -> Level:
-    arrays = {name: _map(group[name], kind, mapped) for name, kind in LEVEL_DATASETS.items()}
+def _read_level(path: str, layout: FileLayout, mapped: NDArray[np.uint8]) -> Level:
+    arrays = {name: layout.array(f"{path}/{name}", mapped) for name in LEVEL_DATASETS}
+    offsets = arrays["cell_offsets"]
+    check_rings(f"{path}/ring_cells", arrays["ring_cells"], len(offsets) - 1)
     grid = AngularGrid(ring_cells=np.array(arrays["ring_cells"]))
     mixture = TubeMixture(**{name: arrays[name] for name in FIELD_SHAPES})
     shapes = {name: (len(mixture), *shape) for name, shape in FIELD_SHAPES.items()}
     shapes |= {"cell_offsets": (grid.num_cells + 1,), "cell_log_mass": (grid.num_cells,)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
-            raise ValueError(f"{group.name}/{name} has the shape {arrays[name].shape}, not {shape}")
-    log_balance = _map(group["log_balance"], LOG_BALANCE, mapped) if "log_balance" in group else UNBALANCED
+            raise ValueError(f"{path}/{name} has the shape {arrays[name].shape}, not {shape}")
+    balanced = f"{path}/log_balance" in layout.datasets
+    log_balance = layout.array(f"{path}/log_balance", mapped) if balanced else UNBALANCED
     if len(log_balance) not in (0, len(mixture)):
-        raise ValueError(f"{group.name}/log_balance has {len(log_balance)} entries, not {len(mixture)}")
-    steps = np.diff(arrays["cell_offsets"], prepend=0, append=len(mixture))
-    if steps[0] != 0 or steps[-1] != 0 or np.any(steps < 0):
-        raise ValueError(f"{group.name}/cell_offsets do not run from 0 to {len(mixture)}")
+        raise ValueError(f"{path}/log_balance has {len(log_balance)} entries, not {len(mixture)}")
+    check_offsets(f"{path}/cell_offsets", offsets, len(mixture))
     return Level(
-        window=float(np.deg2rad(group.attrs["window_deg"])),
+        window=_positive(np.deg2rad(layout.attributes[path]["window_deg"]), f"window_deg of {path}"),
         grid=grid,
-        cell_offsets=arrays["cell_offsets"],
+        cell_offsets=offsets,
         cell_log_mass=arrays["cell_log_mass"],
         mixture=mixture,
         log_balance=log_balance,
     )
 
 
-def _read_update(group: h5py.Group, levels: tuple[Level, ...], mapped: NDArray[np.uint8]) -> Update | None:
-    if "exact_part_id" not in group.attrs:
+def _read_update(
+    station_id: str, layout: FileLayout, levels: tuple[Level, ...], mapped: NDArray[np.uint8]
+) -> Update | None:
+    attributes = layout.attributes[f"stations/{station_id}"]
+    paths = [f"{level_path(station_id, n)}/cell_change" for n in range(len(levels))]
+    if "exact_part_id" not in attributes:
+        if any(path in layout.datasets for path in paths):
+            raise ValueError(f"stations/{station_id} has cell_change and no exact_part_id")
         return None
-    changes = tuple(_map(group[f"levels/{n}/cell_change"], CELL_CHANGE, mapped) for n in range(len(levels)))
-    for n, (change, level) in enumerate(zip(changes, levels, strict=True)):
+    changes = tuple(layout.array(path, mapped) for path in paths)
+    for path, change, level in zip(paths, changes, levels, strict=True):
         if len(change) != level.num_cells:
-            raise ValueError(f"{group.name}/levels/{n}/cell_change has {len(change)} entries, not {level.num_cells}")
+            raise ValueError(f"{path} has {len(change)} entries, not {level.num_cells}")
     return Update(
-        exact_part_id=str(group.attrs["exact_part_id"]),
-        former_part_id=str(group.attrs["former_part_id"]),
-        tolerance=float(group.attrs["update_tolerance"]),
+        exact_part_id=_text(attributes["exact_part_id"]),
+        former_part_id=_text(attributes["former_part_id"]),
+        tolerance=float(attributes["update_tolerance"]),
         cell_change=changes,
     )
 
 
-def _read_scene(file: h5py.File, mapped: NDArray[np.uint8]) -> Scene:
-    arrays = {name: _map(file[name], kind, mapped) for name, kind in SCENE_DATASETS.items()}
-    free_space = file["scene/free_space"]
+def _read_scene(layout: FileLayout, mapped: NDArray[np.uint8]) -> Scene:
+    arrays = {name: layout.array(name, mapped) for name in SCENE_DATASETS}
+    vertices, faces = arrays["scene/vertices_m"], arrays["scene/faces"]
+    face_materials, free = arrays["scene/face_materials"], arrays["scene/free_space"]
+    materials = json.loads(_text(layout.attributes["scene"]["materials"]))
+    if not isinstance(materials, list):
+        raise ValueError("materials are no list")
+    for name, array in (("scene/vertices_m", vertices), ("scene/faces", faces)):
+        if array.shape[1] != 3:
+            raise ValueError(f"{name} has the shape {array.shape}, not (n, 3)")
+    if len(face_materials) != len(faces):
+        raise ValueError(f"scene/face_materials has {len(face_materials)} entries, not {len(faces)}")
+    check_range("scene/faces", faces, 0, len(vertices) - 1)
+    check_range("scene/face_materials", face_materials, -1, len(materials) - 1)
+    check_range("scene/free_space", free, 0, 1)
+    free_space = layout.attributes["scene/free_space"]
     return Scene(
-        vertices=arrays["scene/vertices_m"],
-        faces=arrays["scene/faces"],
-        face_materials=arrays["scene/face_materials"],
-        materials=tuple(json.loads(file["scene"].attrs["materials"])),
+        vertices=vertices,
+        faces=faces,
+        face_materials=face_materials,
+        materials=tuple(_text(name) for name in materials),
         free_space=FreeSpace(
-            origin=np.asarray(free_space.attrs["origin_m"], dtype=np.float64),
-            voxel_size=float(free_space.attrs["voxel_size_m"]),
-            free=arrays["scene/free_space"].view(np.bool_),
+            origin=np.array(_triple(free_space["origin_m"])),
+            voxel_size=_positive(free_space["voxel_size_m"], "voxel_size_m"),
+            free=free.view(np.bool_),
         ),
-        sha256=str(file.attrs["scene_sha256"]),
+        sha256=_text(layout.attributes[""]["scene_sha256"]),
     )
 
 
+def _text(value: Any) -> str:
+    """Text that can be written into answers."""
+    if not isinstance(value, str):
+        raise TypeError(f"{type(value).__name__} where there should be text")
+    value.encode("utf-8")
+    return value
+
+
+def _finite(value: Any) -> float:
+    number = float(value)
+    if not np.isfinite(number):
+        raise ValueError(f"{number} where there should be a finite number")
+    return number
+
+
+def _positive(value: Any, name: str) -> float:
+    if not 0.0 < (number := float(value)) < np.inf:
+        raise ValueError(f"{name} is {number}")
+    return number
+
+
 def _triple(values: Any) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in values)
+    x, y, z = (_finite(v) for v in values)
     return (x, y, z)
-
-
-def _one_line(error: BaseException) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -1,7 +1,6 @@
 """Write table files: beside the final name, checksummed, synced, then renamed into place."""
 
 import contextlib
-import glob
 import io
 import json
 import os
@@ -14,11 +13,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.errors import RayfixError, TableError
-from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.level import Level
-from rayfix_tables.mixture import FIELD_SHAPES
-from rayfix_tables.schema import (
+from rayfix_tables.disk.files import has_signature, why_not_regular
+from rayfix_tables.disk.ownership import own_file, remove_abandoned
+from rayfix_tables.disk.schema import (
     FORMAT,
     FORMAT_VERSION,
     array_digest,
@@ -28,6 +25,10 @@ from rayfix_tables.schema import (
     dataset_paths,
     level_path,
 )
+from rayfix_tables.errors import RayfixError, TableError
+from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.level import Level
+from rayfix_tables.mixture import FIELD_SHAPES
 from rayfix_tables.site import SiteInfo
 from rayfix_tables.update import Update
 
@@ -94,9 +95,16 @@ def check_writable(path: Path) -> None:
     if path.is_dir():
         raise TableError(f"cannot write {path}: it is a folder; give a file name such as {path / 'table.h5'}")
     check_folder(path, TableError)
-    if path.exists() and path.stat().st_size and not h5py.is_hdf5(path):
+    if (what := why_not_regular(path)) is not None:
+        raise TableError(f"cannot write {path}: it {what}; give another name, or remove it first")
+    if path.exists() and path.stat().st_size and not _is_hdf5(path):
         # A site file or a scene by a slip of the hand: only a table gives way to a table.
         raise TableError(f"cannot write {path}: the file there is no table; give another name, or remove it first")
+
+
+def _is_hdf5(path: Path) -> bool:
+    with path.open("rb") as file:
+        return has_signature(file.fileno(), path.stat().st_size)
 
 
 def write_table(
@@ -121,17 +129,18 @@ def write_table(
     TableError
         When the disk is full or the folder cannot be written; no partial file is left.
     """
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
-    _remove_abandoned(path)
+    remove_abandoned(path.parent, f".{path.name}.partial-")
+    partial = None
     try:
-        with _Sink(partial, "w+") as sink:
+        partial, descriptor = own_file(path.parent, f".{path.name}.partial-")
+        with _Sink(descriptor, "w+") as sink:
             try:
                 with h5py.File(sink, "w", alignment_threshold=1, alignment_interval=64) as file:
                     table_id = _write_content(file, site, scene, stations, software_version)
             finally:
                 sink.raise_failure()
             os.fsync(sink.fileno())
-        partial.replace(path)
+            partial.replace(path)  # while it is still known to be in use
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
@@ -142,20 +151,10 @@ def write_table(
             f"cannot write {path}: {_first_line(error)}; free some space or choose another folder"
         ) from error
     finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-    return table_id
-
-
-def _remove_abandoned(path: Path) -> None:
-    """Remove what processes that were killed have left half written."""
-    for partial in path.parent.glob(f".{glob.escape(path.name)}.partial-*"):
-        with contextlib.suppress(OSError, ValueError):
-            process = int(partial.name.rpartition("-")[2])
-            try:
-                os.kill(process, 0)
-            except ProcessLookupError:
+        if partial is not None:
+            with contextlib.suppress(OSError):
                 partial.unlink()
+    return table_id
 
 
 class _Sink(io.FileIO):

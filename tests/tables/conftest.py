@@ -1,99 +1,11 @@
 """Small random tables."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.grid import AngularGrid
-from rayfix_tables.level import Level
-from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
-from rayfix_tables.site import SiteInfo, Station, StationBias
-from rayfix_tables.write import SceneContent, StationContent, write_table
-
-
-@dataclass(frozen=True, kw_only=True)
-class Content:
-    """What a table is written from."""
-
-    site: SiteInfo
-    scene: SceneContent
-    stations: tuple[StationContent, ...]
-
-    def write(self, path: Path, *, software_version: str = "1.2.3") -> str:
-        """Write it and return its ``table_id``."""
-        return write_table(
-            path, site=self.site, scene=self.scene, stations=self.stations, software_version=software_version
-        )
-
-
-def random_mixture(rng: np.random.Generator, count: int) -> TubeMixture:
-    """Numbers of no meaning in the types of a table."""
-    fields = {name: rng.normal(size=(count, *shape)).astype(np.float32) for name, shape in FIELD_SHAPES.items()}
-    fields["num_reflections"] = rng.integers(0, 4, count).astype(np.int8)
-    return TubeMixture(**fields)
-
-
-def random_content(
-    seed: int, *, num_stations: int = 2, num_levels: int = 2, num_faces: int = 5, max_components: int = 3
-) -> Content:
-    """Fill a table with random numbers; cells hold none to ``max_components`` components."""
-    rng = np.random.default_rng(seed)
-    stations, contents = [], []
-    for n in range(num_stations):
-        stations.append(
-            Station(
-                id=f"bs{n}",
-                position=tuple(rng.uniform(-9, 9, 3).tolist()),
-                orientation=tuple(rng.uniform(-3, 3, 3).tolist()),
-                field_of_view=rng.uniform(0.5, 6.0),
-                bias=StationBias(
-                    range=rng.normal(),
-                    range_stdev=rng.random(),
-                    azimuth=rng.normal(),
-                    zenith=rng.normal(),
-                    angle_stdev=rng.random(),
-                ),
-            )
-        )
-        levels = []
-        for window in 0.3 * 2.0 ** np.arange(num_levels):
-            grid = AngularGrid.from_spacing(window / 0.8)
-            counts = rng.integers(0, max_components + 1, grid.num_cells)
-            levels.append(
-                Level(
-                    window=float(window),
-                    grid=grid,
-                    cell_offsets=np.concatenate([[0], np.cumsum(counts)]),
-                    cell_log_mass=np.where(counts > 0, rng.normal(size=len(counts)), -np.inf),
-                    mixture=random_mixture(rng, int(counts.sum())),
-                    log_balance=rng.normal(size=int(counts.sum()) * (not levels)).astype(np.float32),  # the first only
-                )
-            )
-        contents.append(
-            StationContent(levels=tuple(levels), lost_ray_share=rng.random(), coverage=tuple(rng.random(3).tolist()))
-        )
-    return Content(
-        site=SiteInfo(
-            name=f"site {seed}",
-            north=rng.uniform(-3, 3),
-            max_path_length=rng.uniform(1, 99),
-            stations=tuple(stations),
-            document={"site": {"name": "ß", "seed": seed}, "stations": [s.id for s in stations]},
-        ),
-        scene=SceneContent(
-            vertices=rng.normal(size=(3 * num_faces, 3)),
-            faces=rng.integers(0, 3 * num_faces, (num_faces, 3)).astype(np.int32),
-            face_materials=rng.integers(-1, 2, num_faces).astype(np.int16),
-            materials=("itu_concrete", "itu_metal"),
-            free_space=FreeSpace(origin=rng.normal(size=3), voxel_size=0.1, free=rng.random((3, 4, 2)) < 0.5),
-            sha256=f"{seed:064x}",
-        ),
-        stations=tuple(contents),
-    )
+from tests.support.random_tables import Content, random_content
 
 
 @pytest.fixture(scope="session")

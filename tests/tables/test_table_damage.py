@@ -9,9 +9,9 @@ import h5py
 import numpy as np
 import pytest
 
+from rayfix_tables.disk.schema import LEVEL_DATASETS, SCENE_DATASETS
 from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError, TableError
 from rayfix_tables.mixture import FIELD_SHAPES
-from rayfix_tables.schema import LEVEL_DATASETS, SCENE_DATASETS
 from rayfix_tables.table import Table
 from tests.support.refusals import refusal
 
@@ -206,7 +206,8 @@ def test_one_flipped_bit_in_a_dataset(small_table_path: Path, name: str) -> None
     raw[offset + size // 2] ^= 0x01
     small_table_path.write_bytes(raw)
     message = refused(small_table_path, CorruptTableError, REBUILD, read=verified)
-    assert f"the checksum of {name} does not match" in message or "cell_offsets" in name or "ring_cells" in name
+    # Of indices, and of what is then no number, it is said before the checksums are compared.
+    assert f"the checksum of {name} does not match" in message or f"{name} " in message
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from rayfix_tables.disk.ownership import own_file
 from rayfix_tables.errors import TableError
 from rayfix_tables.mixture import TubeMixture
 from rayfix_tables.table import Table
@@ -188,11 +189,15 @@ def test_rights_that_are_missing(tmp_path_factory: pytest.TempPathFactory, make_
 
 
 def test_what_a_killed_process_left_is_removed(make_content: Callable[..., Any], tmp_path: Path) -> None:
-    gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
-    abandoned = tmp_path / f".t.h5.partial-{gone.stdout.strip()}"
+    abandoned, descriptor = own_file(tmp_path, ".t.h5.partial-")
+    os.close(descriptor)
     # Another process is still at work, another table is none of ours, and who knows what the last is.
-    others = {f".t.h5.partial-{os.getppid()}", f".other.h5.partial-{gone.stdout.strip()}", ".t.h5.partial-new"}
-    for name in (abandoned.name, *others):
+    at_work, descriptor = own_file(tmp_path, ".t.h5.partial-")
+    others = {at_work.name, abandoned.name.replace("t.h5", "other.h5"), ".t.h5.partial-new", ".t.h5.partial-1"}
+    for name in others:
         (tmp_path / name).touch()
-    make_content(1).write(tmp_path / "t.h5")
+    try:
+        make_content(1).write(tmp_path / "t.h5")
+    finally:
+        os.close(descriptor)
     assert {entry.name for entry in tmp_path.iterdir()} == {"t.h5", *others}

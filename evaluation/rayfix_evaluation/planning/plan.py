@@ -14,6 +14,7 @@ from rayfix_evaluation.pictures.files import check_picture
 from rayfix_evaluation.planning.forecast import PlanMap, PlanSettings, finite, forecast, summary
 from rayfix_evaluation.planning.forecast import Progress as PlanProgress
 from rayfix_evaluation.planning.picture import draw_comparison, draw_plan
+from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table
 
@@ -62,7 +63,7 @@ def plan_tables(
         If a table cannot be opened, nothing is free at the height, or the picture cannot be written.
     """
     check_picture(output)
-    opened = [Table.open(path) for path in tables]
+    opened = [open_checked(path) for path in tables]
     maps = []
     for table in opened:
         with _bar(f"places of {table.path.name}", enabled=progress) as show:

@@ -24,6 +24,7 @@ from rayfix_evaluation.studies.statements import check_statements
 from rayfix_evaluation.studies.store import Store, code_digest
 from rayfix_evaluation.studies.summary import Run, percentile, summarise
 from rayfix_evaluation.studies.variants import SITE, build_variants, open_site_table
+from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table
 from rayfix_tables.version import software_version
@@ -95,7 +96,7 @@ def evaluate_site(
     except OSError as error:
         raise RayfixError(f"cannot write {work}: {error.strerror}; choose another folder with -o") from error
     site_table = open_site_table(site_path, table_path, work / "tables", jobs=jobs, progress=progress)
-    table = Table.open(site_table)
+    table = open_checked(site_table, whole=False)
     planned = studies(
         effort,
         station_ids=[station.id for station in table.site.stations],

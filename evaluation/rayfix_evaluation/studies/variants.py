@@ -9,8 +9,8 @@ from rayfix_evaluation.studies.store import write_text
 from rayfix_offline.build import build_table
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin.twin import prepare_twin
+from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import TableError
-from rayfix_tables.table import Table
 
 __all__ = ["SITE", "build_variants", "open_site_table"]
 
@@ -38,7 +38,7 @@ def open_site_table(site_path: Path, table_path: Path | None, folder: Path, *, j
         path = folder / f"{SITE}.h5"
         build_table(site_path, path, jobs=jobs, progress=progress)
         return path
-    table = Table.open(table_path)
+    table = open_checked(table_path)
     wanted, found = site.info().document, table.site.document
     different = _difference(wanted, found)
     if different is not None:

@@ -18,7 +18,7 @@ from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin import surfaces
 from rayfix_offline.twin.twin import Twin
 from rayfix_tables.angles import direction, local_to_scene
-from rayfix_tables.schema import FORMAT_VERSION
+from rayfix_tables.disk.schema import FORMAT_VERSION
 from rayfix_tables.site import Station
 
 BUILD_VERSION = 4

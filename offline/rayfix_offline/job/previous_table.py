@@ -5,6 +5,7 @@ scene and compared, cell by cell, with the trace in the new one. Only parts that
 from what the table carries are taken.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,7 @@ from rayfix_offline.rays.trace import StationTrace, trace_station
 from rayfix_offline.scene.scene import Scene
 from rayfix_offline.site import SiteFile, parse_site
 from rayfix_offline.twin.twin import Twin, prepare_scene
+from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import SiteError, TableError
 from rayfix_tables.table import StationPart, Table
 
@@ -145,13 +147,17 @@ class FormerTable:
         return site, twin, {plan.station.id: plan for plan in plan_build(site, twin)}
 
 
-def read_former(path: Path, *, required: bool) -> FormerTable | None:
-    """Open a former table.
+def read_former(
+    path: Path, *, required: bool, refused: Callable[[str], None] = lambda reason: None
+) -> FormerTable | None:
+    """Open a former table, checked in a process of its own.
 
     Parameters
     ----------
     required : bool
         Whether a file that is missing or no table is an error, or just no former table.
+    refused : callable, optional
+        Told why a file that is there is not taken.
 
     Raises
     ------
@@ -159,8 +165,10 @@ def read_former(path: Path, *, required: bool) -> FormerTable | None:
         When a required table cannot be read.
     """
     try:
-        return FormerTable(table=Table.open(path))
-    except TableError:
+        return FormerTable(table=open_checked(path, whole=False))
+    except TableError as error:
         if required:
             raise
+        if path.exists() and path.stat().st_size:
+            refused(f"nothing is taken over from the table that was there: {error}")
         return None

@@ -3,24 +3,33 @@
 A shard holds the fitted cells of one block. It is written beside its name, synced and renamed, and begins with the
 SHA-256 of the rest: half a shard or a damaged one is noticed and built again. Shards are named by all that decides
 their content, so that no shard of another site, scene, seed or version is ever taken for the right one.
+
+Several builds may use one folder at a time, also from containers that share a volume: each holds a lock on it, and only
+the last one removes it.
 """
 
+import contextlib
 import hashlib
 import io
 import json
 import os
 import shutil
+import time
+import uuid
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_tables.disk.ownership import is_at, try_lock
 from rayfix_tables.errors import BuildError
 
 _DIGEST_BYTES = 32
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+_REMOVAL_SECONDS = 0.01  # between two looks at a folder that another build removes
 
 
 def content_key(*parts: Any) -> str:
@@ -30,7 +39,7 @@ def content_key(*parts: Any) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ShardStore:
-    """A folder of shards.
+    """A folder of shards; close it when the build has ended.
 
     Attributes
     ----------
@@ -39,6 +48,7 @@ class ShardStore:
     """
 
     folder: Path
+    _held: list[int] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @classmethod
     def beside(cls, table_path: Path) -> "ShardStore":
@@ -57,9 +67,9 @@ class ShardStore:
         np.savez(buffer, allow_pickle=False, **arrays)
         content = buffer.getvalue()
         path = self.folder / name
-        partial = path.with_name(f"{name}.partial-{os.getpid()}")
+        partial = path.with_name(f"{name}.partial-{uuid.uuid4().hex}")
         try:
-            self.folder.mkdir(exist_ok=True)
+            self._take_folder()
             with partial.open("wb") as file:
                 file.write(hashlib.sha256(content).digest())
                 file.write(content)
@@ -67,7 +77,8 @@ class ShardStore:
                 os.fsync(file.fileno())
             partial.replace(path)
         except OSError as error:
-            partial.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                partial.unlink()
             raise BuildError(
                 f"cannot save {path}: {error.strerror}; nothing finished is lost: free some space and run the same "
                 "build again, it goes on from here"
@@ -91,5 +102,32 @@ class ShardStore:
         return None
 
     def remove(self) -> None:
-        """Remove the folder with all shards, and what a killed build left half written."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Remove the folder with all shards and what a killed build left half written, unless another build uses it."""
+        try:
+            descriptor = self._held.pop() if self._held else os.open(self.folder, _FOLDER)
+        except OSError:  # there is none
+            return
+        try:
+            if try_lock(descriptor) is not False and is_at(descriptor, self.folder):
+                shutil.rmtree(self.folder, ignore_errors=True)
+        finally:
+            os.close(descriptor)
+
+    def close(self) -> None:
+        """Leave the folder to other builds; it stays."""
+        while self._held:
+            os.close(self._held.pop())
+
+    def _take_folder(self) -> None:
+        """Make the folder, and tell other builds that it is in use until it is closed or this process ends."""
+        while not self._held:
+            self.folder.mkdir(exist_ok=True)
+            try:
+                descriptor = os.open(self.folder, _FOLDER)
+            except FileNotFoundError:  # removed just now by a build that was done with it
+                continue
+            if try_lock(descriptor, shared=True) is not False and is_at(descriptor, self.folder):
+                self._held.append(descriptor)
+            else:
+                os.close(descriptor)
+                time.sleep(_REMOVAL_SECONDS)

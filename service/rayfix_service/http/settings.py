@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rayfix_service.adapters.omlox_hub import HubSettings
+from rayfix_tables.checked import CheckLimits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +83,8 @@ class ServiceSettings:
         Slow fixes that are computed at a time, and that may wait for it.
     watch_seconds : float
         Time between two looks at the files of the tables and keys.
+    table_check : CheckLimits
+        Time and memory that the check of a table may take.
     track : bool
         Whether targets are followed where a request does not say.
     hub : HubSettings, optional
@@ -107,6 +110,7 @@ class ServiceSettings:
     slow_fix_threads: int = 2
     slow_fixes_waiting: int = 32
     watch_seconds: float = 2.0
+    table_check: CheckLimits = field(default_factory=CheckLimits)
     track: bool = False
     hub: HubSettings | None = None
     simulation: bool = False

@@ -26,6 +26,7 @@ from rayfix_service.http.answering.feed_relay import FeedRelay
 from rayfix_service.http.answering.locating import Answerer
 from rayfix_service.http.answering.served_tables import ServedTable, Tables
 from rayfix_service.http.answering.slow_work import SlowFixes
+from rayfix_service.http.answering.table_checks import TableChecks
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.problems import Problem, install_problems
 from rayfix_service.http.routes import formats, health, positions, stream, table
@@ -128,7 +129,11 @@ def create_app(
     async def lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
         state = app.state
         state.tables = tables = Tables(
-            tables_path, state.metrics, runtime_folder=settings.runtime_folder, at_hand=at_hand
+            tables_path,
+            state.metrics,
+            runtime_folder=settings.runtime_folder,
+            at_hand=at_hand,
+            checks=TableChecks(settings.runtime_folder, settings.table_check),
         )
         keeping = [asyncio.create_task(tables.keep(settings.watch_seconds))]
         if keys is not None:

@@ -13,14 +13,16 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import NamedTemporaryFile, TemporaryDirectory
+from tempfile import NamedTemporaryFile
 from typing import cast
 
 import uvicorn
 
 from rayfix_service.http.access.keys import read_key_file
 from rayfix_service.http.access.rates import Accounts
-from rayfix_service.http.answering.served_tables import forget_changed, load_tables
+from rayfix_service.http.answering.runtime_folder import runtime_folder
+from rayfix_service.http.answering.served_tables import follow_changes, load_tables
+from rayfix_service.http.answering.table_checks import TableChecks
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.settings import ConnectionLimits, ServiceSettings
 from rayfix_service.http.telemetry.connections import Crowd
@@ -28,7 +30,7 @@ from rayfix_service.http.telemetry.logs import LogFormat, log_config
 from rayfix_service.http.telemetry.metrics import MULTIPROCESS_VARIABLE, share_figures
 from rayfix_service.server.app import create_app
 from rayfix_service.server.protocol import GatheringProtocol, SocketProtocol
-from rayfix_service.server.workers import COULD_NOT_START, run_workers
+from rayfix_service.server.workers import COULD_NOT_START, run_workers, tell_failure, tell_started
 from rayfix_tables.errors import RayfixError
 
 _MESSAGES = 2  # times as long as a report may be, a message is answered that it is too long; then the connection ends
@@ -81,10 +83,10 @@ def serve(
     Raises
     ------
     TableError
-        When a table is missing, of another format, or damaged.
+        When no table is whole: missing, of another format, or damaged. Where others are whole, these are served.
     ServiceError
-        When the port is taken, an argument is out of range, the keys are missing, or the folder for figures cannot be
-        written to.
+        When no worker can start, the port is taken, an argument is out of range, the keys are missing, or the folder
+        for figures cannot be written to.
     """
     path = Path(tables_path).absolute()
     settings = replace(settings or ServiceSettings(), own_process=True)
@@ -105,7 +107,8 @@ def serve(
             settings = replace(settings, runtime_folder=stack.enter_context(_runtime_folder()))
         if MULTIPROCESS_VARIABLE in os.environ:
             _check_room(Path(os.environ[MULTIPROCESS_VARIABLE]))
-        at_hand = load_tables(path)
+        checks = TableChecks(settings.runtime_folder, settings.table_check)
+        at_hand = load_tables(path, checks=checks)
         limits = fitting(settings.connection_limits)
         config = uvicorn.Config(
             partial(create_app, path, settings, at_hand=at_hand, accounts=Accounts()),
@@ -136,7 +139,7 @@ def serve(
             run_workers(
                 partial(_work, config, bound),
                 count=workers,
-                meanwhile=partial(forget_changed, at_hand),
+                meanwhile=partial(follow_changes, at_hand, path, checks, failed=set()),
                 ending=bound.close,  # or the system would take connections that nobody answers
             )
 
@@ -163,7 +166,7 @@ def _work(config: uvicorn.Config, bound: socket.socket) -> None:
     try:
         _run(config, bound)
     except RayfixError as error:
-        _log.critical("a worker cannot start: %s", error)
+        tell_failure(str(error))
         sys.exit(COULD_NOT_START)
 
 
@@ -181,6 +184,12 @@ class _Server(uvicorn.Server):
     Such a request may wait in a connection that is not yet accepted or read, and uvicorn would close that.
     """
 
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start to listen."""
+        await super().startup(sockets)
+        if self.started:
+            tell_started()
+
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Take what has arrived, then stop listening and finish what is under way."""
         await asyncio.sleep(_ARRIVING_SECONDS)
@@ -190,19 +199,19 @@ class _Server(uvicorn.Server):
 @contextmanager
 def _runtime_folder() -> Iterator[Path]:
     """Make the folder that workers share, with a place for their figures unless the environment names one."""
-    try:
-        folder = TemporaryDirectory(prefix="rayfix-")
-    except OSError as error:
-        raise ServiceError(
-            f"the workers need a temporary folder and there is none ({error.strerror}); set TMPDIR to one"
-        ) from None
-    with folder as name, ExitStack() as stack:
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(runtime_folder())
+        except OSError as error:
+            raise ServiceError(
+                f"the workers need a temporary folder and there is none ({error.strerror}); set TMPDIR to one"
+            ) from None
         if MULTIPROCESS_VARIABLE not in os.environ:
             # Whichever worker is asked answers for all.
-            (Path(name) / "metrics").mkdir()
-            os.environ[MULTIPROCESS_VARIABLE] = str(Path(name) / "metrics")
+            (folder / "metrics").mkdir()
+            os.environ[MULTIPROCESS_VARIABLE] = str(folder / "metrics")
             stack.callback(os.environ.pop, MULTIPROCESS_VARIABLE)
-        yield Path(name)
+        yield folder
 
 
 def _check_room(folder: Path) -> None:

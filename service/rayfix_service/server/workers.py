@@ -12,11 +12,14 @@ from collections.abc import Callable
 from rayfix_service.http.errors import ServiceError
 
 COULD_NOT_START = 3
-"""Exit status of a worker that could not start, as uvicorn has it; its successor could not either."""
+"""Exit status of a worker that could not start, as uvicorn has it; its successor may, after a pause."""
 
 _LOOK_SECONDS = 0.5  # between two looks at the workers, and between two beats of each
 _SILENT_LOOKS = 60  # a worker without a beat for so many is replaced; a kernel may keep it silent for some
 _ENDING_SECONDS = 20.0  # then what has not ended is killed; requests under way get less
+_LONGEST_PAUSE_SECONDS = 10.0  # before the next try after workers that could not start
+_SHARED_BYTES = 16
+_FAILURE_BYTES = 2048
 _END = (signal.SIGINT, signal.SIGTERM)
 
 _FORK = multiprocessing.get_context("fork")
@@ -29,7 +32,8 @@ def run_workers(
     """Run worker processes until this process is told to end (SIGINT, SIGTERM), then have them end.
 
     Workers have all that this process has: its memory is theirs until either writes to it. It must have no other
-    thread. They end by themselves when it dies.
+    thread. They end by themselves when it dies. One that ends is replaced: at once if it had started (see
+    :func:`tell_started`), after a pause that grows if not.
 
     Parameters
     ----------
@@ -44,15 +48,19 @@ def run_workers(
     Raises
     ------
     ServiceError
-        When a worker cannot start.
+        When none of the first workers can start.
     """
     # Blocked signals wait to be asked for, and reach no worker before it has handlers of its own.
     former = signal.pthread_sigmask(signal.SIG_BLOCK, _END)
+    starts = _Starts(count=count)
     workers: list[_Worker] = []
+    look = 0.0
     try:
-        while signal.sigtimedwait(_END, _LOOK_SECONDS if workers else 0) is None:
-            workers = [worker for worker in workers if worker.is_well()]
-            while len(workers) < count:
+        while signal.sigtimedwait(_END, look) is None:
+            look = _LOOK_SECONDS
+            starts.note(workers)
+            workers = [worker for worker in workers if worker.process.is_alive()]
+            while len(workers) < count and starts.may_be_tried():
                 workers.append(_Worker(work))
             meanwhile()
     finally:
@@ -68,26 +76,92 @@ def run_workers(
         signal.pthread_sigmask(signal.SIG_SETMASK, former)
 
 
+class _Starts:
+    """Whether workers start, and when the next one may try after some that could not."""
+
+    def __init__(self, *, count: int) -> None:
+        self._count = count
+        self._any_started = False
+        self._failed = 0
+        self._reason = ""
+        self._not_before = 0.0
+
+    def may_be_tried(self) -> bool:
+        """Tell whether the pause is over."""
+        return time.monotonic() >= self._not_before
+
+    def note(self, workers: list["_Worker"]) -> None:
+        """Take in what became of the workers since the last look.
+
+        Raises
+        ------
+        ServiceError
+            When as many as there should be could not start, and none ever has.
+        """
+        for worker in workers:
+            if worker.has_started and not worker.seen_to_start:
+                worker.seen_to_start = self._any_started = True
+                self._failed, self._reason, self._not_before = 0, "", 0.0
+            if worker.is_well():
+                continue
+            if not worker.seen_to_start:
+                self._failed += 1
+                self._not_before = time.monotonic() + min(_LOOK_SECONDS * 2.0**self._failed, _LONGEST_PAUSE_SECONDS)
+            if worker.process.exitcode == COULD_NOT_START:
+                self._note_failure(worker.failure or "the log says why")
+        others = sum(worker.process.is_alive() for worker in workers)
+        if self._reason and not self._any_started and not others and self._failed >= self._count:
+            raise ServiceError(f"a worker could not start; {self._reason}")
+
+    def _note_failure(self, reason: str) -> None:
+        if reason != self._reason:
+            _log.critical("a worker cannot start and is tried again: %s", reason)
+        self._reason = reason
+
+
+_own: "_Worker | None" = None  # in a worker, itself
+
+
+def tell_started() -> None:
+    """Tell the process that forked this one that it does its work; does nothing in a process that is no worker."""
+    if _own is not None:
+        _own.shared[1] = 1
+
+
+def tell_failure(reason: str) -> None:
+    """Tell the process that forked this one why it cannot start, before it ends with ``COULD_NOT_START``."""
+    if _own is not None:
+        text = reason.encode("utf-8", "backslashreplace")[: _FAILURE_BYTES - 1]
+        _own.told[: len(text) + 1] = text + b"\0"
+
+
 class _Worker:
     """A worker process, as the process that forked it sees it."""
 
     def __init__(self, work: Callable[[], None]) -> None:
         # Looks are counted and not the time: all processes may be stopped for long together.
-        self._beats = memoryview(mmap.mmap(-1, 8)).cast("Q")
+        memory = memoryview(mmap.mmap(-1, _SHARED_BYTES + _FAILURE_BYTES))
+        self.shared = memory[:_SHARED_BYTES].cast("Q")  # beats, and whether it has started
+        self.told = memory[_SHARED_BYTES:]
+        self.seen_to_start = False
         self._beats_seen = 0
         self._silent_looks = 0
-        self.process = _FORK.Process(target=_live, args=(work, self._beats, os.getpid()))
+        self.process = _FORK.Process(target=_live, args=(work, self, os.getpid()))
         self.process.start()
 
-    def is_well(self) -> bool:
-        """Tell whether the process runs and beats; it has ended otherwise.
+    @property
+    def has_started(self) -> bool:
+        """Whether it has told that it does its work."""
+        return self.shared[1] != 0
 
-        Raises
-        ------
-        ServiceError
-            When it could not start.
-        """
-        beats = self._beats[0]
+    @property
+    def failure(self) -> str:
+        """Why it could not start, if it has told."""
+        return bytes(self.told).partition(b"\0")[0].decode("utf-8", "replace")
+
+    def is_well(self) -> bool:
+        """Tell whether the process runs and beats; it has ended otherwise."""
+        beats = self.shared[0]
         self._silent_looks = self._silent_looks + 1 if beats == self._beats_seen else 0
         self._beats_seen = beats
         if self.process.is_alive() and self._silent_looks < _SILENT_LOOKS:
@@ -96,19 +170,19 @@ class _Worker:
             _log.error("worker %d hangs and is replaced", self.process.pid)
             self.process.kill()
             self.process.join()
-        elif self.process.exitcode == COULD_NOT_START:
-            raise ServiceError("a worker could not start; the log says why")
-        else:
+        elif self.process.exitcode != COULD_NOT_START:
             _log.error("worker %d has ended with status %d and is replaced", self.process.pid, self.process.exitcode)
         return False
 
 
-def _live(work: Callable[[], None], beats: memoryview, parent: int) -> None:
+def _live(work: Callable[[], None], own: _Worker, parent: int) -> None:
     """Be a worker."""
+    global _own
+    _own = own
     for number in _END:
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _END)
-    threading.Thread(target=_beat, args=(beats, parent), daemon=True).start()
+    threading.Thread(target=_beat, args=(own.shared, parent), daemon=True).start()
     work()
 
 

@@ -2,24 +2,29 @@
 
 import asyncio
 import logging
+import threading
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from rayfix_service.fusion.locator import Locator
+from rayfix_service.http.answering.table_checks import TableChecks
+from rayfix_service.http.answering.table_files import FileState, FoundFiles, TableFiles, file_state, no_table
 from rayfix_service.http.problems import INVALID_PARAMETER, NOT_FOUND, NOT_READY, ProblemError
 from rayfix_service.http.telemetry.metrics import Metrics
 from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire import FieldProblem
+from rayfix_tables.checked import VERDICTS
 from rayfix_tables.errors import RayfixError, TableError
 from rayfix_tables.site import SiteInfo
 from rayfix_tables.table import Table
 
-_log = logging.getLogger(__name__)
+_CHECKS_AT_A_TIME = 4  # of one process; a file that is not whole may take all of its time
+_AGAIN_SECONDS = 10.0  # after which a file that could not be checked is looked at again
 
-FileState = tuple[int, int, int] | None
-"""What tells one version of a file from the next: inode, size and time; None for a missing file."""
+_log = logging.getLogger(__name__)
 
 Change = Literal["loaded", "unchanged", "removed", "refused"]
 
@@ -60,73 +65,76 @@ class TableChange:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TableFiles:
-    """Where tables come from: one file, or the ``*.h5`` of a folder."""
+class Refusal:
+    """A version of a file that is not served.
 
-    path: Path
+    Attributes
+    ----------
+    state : tuple of int or None
+        Of the file.
+    reason : str
+        Without the file's folder.
+    """
 
-    def find(self) -> dict[str, Path]:
-        """Return the files by the names of their tables, sorted.
-
-        Raises
-        ------
-        TableError
-            When a folder has none.
-        """
-        if not self.path.is_dir():
-            return {self.path.stem: self.path}
-        # A file that is being written has another suffix or, as those of rsync, a dot before its name.
-        files = {path.stem: path for path in sorted(self.path.glob("*.h5")) if not path.name.startswith(".")}
-        if not files:
-            raise TableError(f"there is no table in {self.path}; put files T.h5 that 'rayfix build' wrote there")
-        return files
-
-    def states(self) -> dict[str, FileState]:
-        """Look which files there are and in which version; empty where the folder has none."""
-        try:
-            return {name: file_state(path) for name, path in self.find().items()}
-        except (TableError, OSError):
-            return {}
+    state: FileState
+    reason: str
 
 
-def file_state(path: Path) -> FileState:
-    """Tell this version of a file from others."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return (status.st_ino, status.st_size, status.st_mtime_ns)
+def load_table(
+    name: str, path: Path, *, checks: TableChecks | None = None, given_up: threading.Event | None = None
+) -> ServedTable:
+    """Have a table checked in a process of its own, map it, and compile the kernels.
 
-
-def load_table(name: str, path: Path) -> ServedTable:
-    """Open a table, read every byte of it, and compile the kernels.
+    Parameters
+    ----------
+    checks : TableChecks, optional
+    given_up : threading.Event, optional
+        Ends the check early.
 
     Raises
     ------
     TableError
         When the file is no whole table.
     """
-    state = file_state(path)
-    table = Table.open(path)
-    table.verify()
-    if file_state(path) != state:
-        raise TableError(f"{path} changed while it was read; write tables beside and rename them into place")
-    locator = Locator(table)
-    locator.warm_up()
-    tracker = Tracker(table.scene)
-    tracker.warm_up()
-    return ServedTable(name=name, locator=locator, tracker=tracker, state=state)
+    checks = checks or TableChecks()
+    table, state = checks.open(path, given_up)
+    served = _warmed_up(_serve(name, table, state))
+    checks.note_loaded(path, state)
+    return served
 
 
-def load_tables(path: Path) -> dict[str, ServedTable]:
-    """Load a table, or all tables of a folder, by name.
+def _warmed_up(served: ServedTable) -> ServedTable:
+    served.locator.warm_up()
+    served.tracker.warm_up()
+    return served
+
+
+def _serve(name: str, table: Table, state: FileState) -> ServedTable:
+    return ServedTable(name=name, locator=Locator(table), tracker=Tracker(table.scene), state=state)
+
+
+def load_tables(path: Path, *, checks: TableChecks | None = None) -> dict[str, ServedTable]:
+    """Load a table, or all whole tables of a folder, by name.
 
     Raises
     ------
     TableError
-        When one of the files is no whole table, or a folder has none.
+        When no file is a whole table, or a folder has none.
     """
-    return {name: load_table(name, file) for name, file in TableFiles(path=path).find().items()}
+    checks = checks or TableChecks()
+    files = TableFiles(path=path).find()
+    with ThreadPoolExecutor(_CHECKS_AT_A_TIME) as pool:  # a file that is not whole may take long
+        opening = {name: pool.submit(checks.open, file) for name, file in files.items()}
+    loaded: dict[str, ServedTable] = {}
+    refusals: list[TableError] = []
+    for name, future in opening.items():
+        try:
+            loaded[name] = _warmed_up(_serve(name, *future.result()))
+        except TableError as error:
+            refusals.append(error)
+    if not loaded:
+        raise refusals[0]
+    return loaded
 
 
 def forget_changed(tables: dict[str, ServedTable]) -> None:
@@ -134,6 +142,37 @@ def forget_changed(tables: dict[str, ServedTable]) -> None:
     for name, served in list(tables.items()):
         if file_state(served.locator.table.path) != served.state:
             del tables[name]
+
+
+def follow_changes(tables: dict[str, ServedTable], path: Path, checks: TableChecks, *, failed: set[FileState]) -> None:
+    """Put tables in that workers have loaded since, and take out those whose files are gone.
+
+    A table whose file has become another stays until a worker has loaded that: so there is always one that can answer
+    for whoever is forked next.
+
+    Parameters
+    ----------
+    failed : set of FileState
+        Takes the files that this process could not load, so that it does not try again.
+    """
+    try:
+        found = TableFiles(path=path).look()
+    except OSError:
+        return
+    if not any(state is not None for state in found.states.values()):  # not mounted for a moment
+        return
+    for name in tables.keys() - found.files.keys():
+        del tables[name]
+    for name, file in found.files.items():
+        state = found.states[name]
+        if state in failed or (name in tables and tables[name].state == state):
+            continue
+        try:
+            if (opened := checks.open_loaded(file)) is not None:
+                tables[name] = _serve(name, *opened)
+        except Exception:  # the workers go on
+            _log.exception("%s is not kept for workers to come", file)
+            failed.add(state)
 
 
 class Tables:
@@ -150,8 +189,9 @@ class Tables:
     runtime_folder : pathlib.Path, optional
         Folder through which the workers of one service tell each other to look at all files.
     at_hand : dict of str to ServedTable, optional
-        Tables that are loaded already, by name. One whose file has not changed since is served at once. Each is taken
-        out, so that nothing holds it when it is swapped.
+        Tables that are loaded already, by name. One whose file has not changed since is served at once, and one whose
+        file has become a bad one, too. Each is taken out, so that nothing holds it when it is swapped.
+    checks : TableChecks, optional
     """
 
     def __init__(
@@ -161,19 +201,30 @@ class Tables:
         *,
         runtime_folder: Path | None = None,
         at_hand: dict[str, ServedTable] | None = None,
+        checks: TableChecks | None = None,
     ) -> None:
         self._files = TableFiles(path=path)
         self._metrics = metrics
+        self._checks = checks or TableChecks(runtime_folder)
         self._marker = None if runtime_folder is None else runtime_folder / "reload"
         self._marked: FileState = None if self._marker is None else file_state(self._marker)
         self._at_hand = {} if at_hand is None else at_hand
         self._served: Mapping[str, ServedTable] = {}
-        self._refused: dict[str, FileState] = {}
+        self._refused: dict[str, Refusal] = {}
+        self._found = FoundFiles(files={}, states={}, unfit={})
         self._looked_at: dict[str, FileState] = {}
-        self._lock = asyncio.Lock()
+        self._not_before: dict[str, float] = {}
+        self._locks: dict[str, asyncio.Lock] = {}
+        self._looking: dict[str, asyncio.Task[TableChange]] = {}
+        self._at_a_time = asyncio.Semaphore(_CHECKS_AT_A_TIME)
         self._runtime_folder = runtime_folder
         self._failure: str | None = None
         self.became_ready = asyncio.Event()
+
+    @property
+    def refused(self) -> tuple[str, ...]:
+        """Names of files that are refused in their present version, sorted; an older one may answer."""
+        return tuple(sorted(name for name in self._refused if name))
 
     def all(self) -> tuple[ServedTable, ...]:
         """Return all tables, sorted by name, or end the request with 503.
@@ -235,13 +286,17 @@ class Tables:
             changes = [TableChange(name="", change="refused")]
         if not self.became_ready.is_set() and any(change.change == "refused" for change in changes):
             self._failure = "a table does not pass its check, the log says why; replace it"
-        before = self._looked_at
-        while True:
-            await asyncio.sleep(seconds)
-            try:
-                before = await self._watch_once(before)
-            except Exception:
-                _log.exception("looking at the tables failed; they stay as they are")
+        before = dict(self._looked_at)
+        try:
+            while True:
+                await asyncio.sleep(seconds)
+                try:
+                    before = await self._watch_once(before)
+                except Exception:
+                    _log.exception("looking at the tables failed; they stay as they are")
+        finally:
+            for task in self._looking.values():
+                task.cancel()
 
     async def refresh(self, *, again: bool = False) -> list[TableChange]:
         """Look at all files; load those that are new.
@@ -252,20 +307,18 @@ class Tables:
             Also look again at what was refused before, and no longer serve tables whose files are gone. Otherwise
             they stay: a folder that is gone for a moment must not take the service with it.
         """
-        async with self._lock:
-            try:
-                files = self._files.find()
-            except (TableError, OSError) as error:
-                return [self._refuse("", self._files.path, None, error)]
-            self._looked_at = self._files.states()
-            changes = []
-            for name, path in files.items():
-                changes.append(await self._look(name, path, again=again))
-            if again:
-                changes += [self._remove(name) for name in self._served.keys() - files.keys()]
-            if self._served.keys() >= files.keys():
-                self._become_ready()
-            return changes
+        try:
+            self._found = found = self._files.look()
+        except OSError as error:
+            return [self._refuse("", self._files.path, None, error)]
+        if not found.files:
+            return [self._refuse("", self._files.path, None, no_table(self._files.path, found))]
+        changes = self._tell_unfit(found)
+        looks = (self._look(name, path, again=again) for name, path in found.files.items())
+        changes += await asyncio.gather(*looks)
+        if again:
+            changes += [self._remove(name) for name in self._served.keys() - found.files.keys()]
+        return changes
 
     async def reload(self) -> list[TableChange]:
         """Look at all files, and tell the other workers to."""
@@ -276,17 +329,46 @@ class Tables:
         return changes
 
     async def _watch_once(self, before: dict[str, FileState]) -> dict[str, FileState]:
-        now = await asyncio.to_thread(self._files.states)
+        try:
+            self._found = found = await asyncio.to_thread(self._files.look)
+        except OSError:
+            return before
         marked = None if self._marker is None else file_state(self._marker)
         if marked != self._marked:
             self._marked = marked
             await self.refresh(again=True)
-        elif now == before and now != self._looked_at:
-            await self.refresh()
-        return now
+            return found.states
+        self._tell_unfit(found)
+        now = asyncio.get_running_loop().time()
+        for name, state in found.states.items():
+            # Each file by itself: one that changes all the time must not keep the others waiting.
+            settled = name in before and before[name] == state != self._looked_at.get(name)
+            waits = self._is_refused(name, state) and now < self._not_before.get(name, now)
+            if settled and state is not None and not waits and name not in self._looking:
+                self._looking[name] = task = asyncio.create_task(self._look(name, found.files[name], again=False))
+                task.add_done_callback(lambda done, name=name: self._looked(name, done))  # type: ignore[misc]
+        return found.states
+
+    def _looked(self, name: str, done: asyncio.Task[TableChange]) -> None:
+        del self._looking[name]
+        if not done.cancelled() and (error := done.exception()) is not None:
+            _log.error("looking at table %s failed", name, exc_info=error)
+
+    def _is_refused(self, name: str, state: FileState) -> bool:
+        return name in self._refused and self._refused[name].state == state
+
+    def _tell_unfit(self, found: FoundFiles) -> list[TableChange]:
+        """Refuse what cannot be a table by its name or kind, once; forget what is no longer there."""
+        if found.files:
+            for name in self._refused.keys() - found.files.keys() - found.unfit.keys():
+                del self._refused[name]
+            self._metrics.tables_refused(len(self.refused))
+        return [self._refuse(name, self._files.path, None, TableError(reason)) for name, reason in found.unfit.items()]
 
     def _become_ready(self) -> None:
-        if self.became_ready.is_set():
+        """Become ready once all files are served but for those that are refused."""
+        pending = self._found.files.keys() - self._served.keys() - self._refused.keys()
+        if self.became_ready.is_set() or pending or not self._served:
             return
         self.became_ready.set()
         self._metrics.became_ready()
@@ -295,40 +377,73 @@ class Tables:
         _log.info("ready with %s", ", ".join(_described(table) for table in self._served.values()))
 
     async def _look(self, name: str, path: Path, *, again: bool) -> TableChange:
-        state = file_state(path)
-        served = self._served.get(name)
-        if served is not None and served.state == state:
-            self._refused.pop(name, None)
-            return TableChange(name=name, change="unchanged")
-        if not again and name in self._refused and self._refused[name] == state:
-            return TableChange(name=name, change="unchanged")
-        try:
-            table = self._at_hand.pop(name, None)
-            if table is None or table.state != state:
-                table = await asyncio.to_thread(load_table, name, path)
-        except Exception as error:
-            return self._refuse(name, path, state, error)
-        self._refused.pop(name, None)
-        if served is not None:
+        async with self._locks.setdefault(name, asyncio.Lock()):
+            self._looked_at[name] = state = file_state(path)
+            served = self._served.get(name)
+            if served is not None and served.state == state:
+                self._accept(name)
+                return TableChange(name=name, change="unchanged")
+            if self._is_refused(name, state) and not again and name not in self._not_before:
+                return TableChange(name=name, change="unchanged")
+            at_hand = self._at_hand.pop(name, None)
+            if at_hand is not None and (served is None or at_hand.state == state):
+                change = self._take(at_hand)  # even if its file has changed: until the new one has passed
+                if at_hand.state == state:
+                    return change
+            try:
+                return self._take(await self._load(name, path))
+            except Exception as error:
+                return self._refuse(name, path, state, error)
+
+    async def _load(self, name: str, path: Path) -> ServedTable:
+        given_up = threading.Event()
+        async with self._at_a_time:
+            try:
+                return await asyncio.to_thread(load_table, name, path, checks=self._checks, given_up=given_up)
+            finally:
+                given_up.set()
+
+    def _take(self, table: ServedTable) -> TableChange:
+        """Serve a table from now on."""
+        name = table.name
+        self._accept(name)
+        if (served := self._served.get(name)) is not None:
             self._metrics.table_left(name, served.locator.table)
         self._served = dict(sorted({**self._served, name: table}.items()))
         self._metrics.table_loaded(name, table.locator.table)
         if self.became_ready.is_set():
             _log.info("loaded %s", _described(table))
+        self._become_ready()
         return TableChange(name=name, change="loaded")
 
+    def _accept(self, name: str) -> None:
+        self._refused.pop(name, None)
+        self._not_before.pop(name, None)
+        self._metrics.tables_refused(len(self.refused))
+
     def _refuse(self, name: str, path: Path, state: FileState, error: Exception) -> TableChange:
-        self._refused[name] = state
-        self._metrics.table_refused()
         if isinstance(error, RayfixError | OSError):
             reason = str(error).replace(str(path), path.name)
-            _log.error("table refused: %s", error)
         else:
             reason = f"{path.name} cannot be loaded; the log says why"
+        if isinstance(error, TableError) and not isinstance(error, VERDICTS) and state is not None:
+            # It may be over soon: no memory for the check, no right to read the file.
+            self._looked_at.pop(name, None)
+            self._not_before[name] = asyncio.get_running_loop().time() + _AGAIN_SECONDS
+        before, self._refused[name] = self._refused.get(name), Refusal(state=state, reason=reason)
+        self._metrics.tables_refused(len(self.refused))
+        self._become_ready()
+        change = TableChange(name=name, change="refused", reason=reason)
+        if before == self._refused[name]:
+            return change  # said already
+        self._metrics.table_refused()
+        if isinstance(error, RayfixError | OSError):
+            _log.error("table refused: %s", error)
+        else:
             _log.error("table refused: %s", path, exc_info=error)
         if name in self._served:
             _log.warning("%s goes on answering", _described(self._served[name]))
-        return TableChange(name=name, change="refused", reason=reason)
+        return change
 
     def _remove(self, name: str) -> TableChange:
         table = self._served[name]

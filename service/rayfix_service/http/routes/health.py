@@ -26,10 +26,14 @@ class ReadyTable(BaseModel):
 
 
 class Ready(BaseModel):
-    """All tables are checked and the kernels are compiled."""
+    """All tables are checked, at least one answers, and the kernels are compiled."""
 
     status: Literal["ready"] = "ready"
     tables: list[ReadyTable]
+    refused: list[str] = Field(
+        default=[],
+        description="names of files that do not pass their check; a table that was loaded before may answer for one",
+    )
 
 
 @router.get("/livez", summary="Does the process answer?")
@@ -41,7 +45,10 @@ async def livez() -> Alive:
 @router.get("/readyz", summary="Can it locate?", responses=problem_responses(NOT_READY))
 async def readyz(tables: TablesDep) -> Ready:
     """Answer 200 once all tables are checked and the kernels are compiled, and 503 before."""
-    return Ready(tables=[ReadyTable(name=t.name, table_id=t.locator.table.table_id) for t in tables.all()])
+    return Ready(
+        tables=[ReadyTable(name=t.name, table_id=t.locator.table.table_id) for t in tables.all()],
+        refused=list(tables.refused),
+    )
 
 
 @router.get("/metrics", summary="Figures for Prometheus", response_class=PlainTextResponse)

@@ -7,7 +7,7 @@ from typing import get_args
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, values
 from prometheus_client.exposition import choose_encoder
-from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
+from prometheus_client.multiprocess import MultiProcessCollector
 
 from rayfix_service.adapters.omlox_hub import HubOutcome
 from rayfix_service.fusion.posterior.fix import Fix, Status
@@ -93,6 +93,13 @@ class Metrics:
             registry=self._registry,
         )
         self._loads = {outcome: loads.labels(outcome) for outcome in ("loaded", "refused")}
+        self._refused = Gauge(
+            "rayfix_tables_refused",
+            "Tables' files that are refused as they are now",
+            registry=self._registry,
+            multiprocess_mode="livemax",
+        )
+        self._refused.set(0)
         self._ready = Gauge(
             "rayfix_ready", "1 once the service can locate", registry=self._registry, multiprocess_mode="livemin"
         )
@@ -143,6 +150,10 @@ class Metrics:
         """Tell that a table did not pass its check."""
         self._loads["refused"].inc()
 
+    def tables_refused(self, count: int) -> None:
+        """Tell how many files are refused as they are now."""
+        self._refused.set(count)
+
     def became_ready(self) -> None:
         """Tell that the service can locate."""
         self._ready.set(1)
@@ -180,9 +191,11 @@ def forget_dead_workers() -> None:
     folder = os.environ.get(MULTIPROCESS_VARIABLE)
     if folder is None:
         return
-    for pid in {path.stem.rpartition("_")[2] for path in Path(folder).glob("gauge_live*.db")}:
-        if not _is_alive(int(pid)):
-            mark_process_dead(pid, folder)  # type: ignore[no-untyped-call]
+    for path in Path(folder).glob("gauge_live*.db"):
+        pid = path.stem.rpartition("_")[2]
+        # Not by mark_process_dead, which fails where another worker removes the same file at the same time.
+        if pid.isdecimal() and not _is_alive(int(pid)):
+            path.unlink(missing_ok=True)
 
 
 def _is_alive(pid: int) -> bool:

@@ -41,7 +41,7 @@ def test_alive_at_once_and_ready_later(hall_table_path: Path, monkeypatch: pytes
         app.wait_until_ready()
         ready = app.get("/readyz").json()
         table_id = app.get("/v1/table").json()["table_id"]
-        assert ready == {"status": "ready", "tables": [{"name": "hall", "table_id": table_id}]}
+        assert ready == {"status": "ready", "tables": [{"name": "hall", "table_id": table_id}], "refused": []}
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ import h5py
 import pytest
 
 from rayfix_service.server.server import serve
+from rayfix_tables.disk.schema import content_attributes, content_id, dataset_paths
 from rayfix_tables.errors import TableError
-from rayfix_tables.schema import content_attributes, content_id, dataset_paths
 from tests.support.damage import flip_a_bit
 from tests.support.reports import REPORT
 from tests.support.running_app import RunningApp
@@ -206,8 +206,9 @@ def test_no_request_fails_while_tables_are_swapped(hall_table_path: Path, tmp_pa
 
 
 def test_what_cannot_be_served_is_said_at_the_start(folder: Path, hall_table_path: Path, tmp_path: Path):
-    put_damaged(hall_table_path, folder / "upper.h5")
-    with pytest.raises(TableError, match=r"upper\.h5 is damaged"):
+    for name in ("ground", "upper"):
+        put_damaged(hall_table_path, folder / f"{name}.h5")
+    with pytest.raises(TableError, match=r"ground\.h5 is damaged"):
         serve(folder)
     empty = tmp_path / "empty"
     empty.mkdir()

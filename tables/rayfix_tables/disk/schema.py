@@ -90,16 +90,29 @@ def content_id(attributes: Mapping[str, Any], digests: Mapping[str, str]) -> str
 
 def content_attributes(file: h5py.File) -> dict[str, Any]:
     """Gather the attributes that belong to the content, by path; not the checksums, nor who wrote it when."""
-    found: dict[str, Any] = {}
+    gathered: dict[str, dict[str, Any]] = {"": dict(file.attrs)}
+    file.visititems(lambda name, node: gathered.update({name: dict(node.attrs)}))
+    return content_of(
+        {
+            path: {
+                key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+                for key, value in attributes.items()
+            }
+            for path, attributes in gathered.items()
+        }
+    )
 
-    def visit(name: str, node: h5py.Group | h5py.Dataset) -> None:
-        for key, value in node.attrs.items():
-            if key != "sha256":
-                found[f"{name}@{key}"] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
-    file.visititems(visit)
+def content_of(attributes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Choose the attributes that belong to the content of those of all objects, by path; the root's is ``""``."""
+    found = {
+        f"{path}@{key}": value
+        for path, each in attributes.items()
+        for key, value in each.items()
+        if path and key != "sha256"
+    }
     for key in ("format", "format_version", "site", "scene_sha256"):
-        found[f"@{key}"] = str(file.attrs.get(key))
+        found[f"@{key}"] = str(attributes[""].get(key))
     return found
 
 

@@ -1,0 +1,121 @@
+"""A table's file as the system knows it: looked at before it is opened, and never anything but a regular file."""
+
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_tables.errors import NotATableError, TableError
+
+FileState = tuple[int, int, int]
+"""What tells one version of a file from the next: inode, size and time of the last change."""
+
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenFile:
+    """A regular file that is open for reading.
+
+    Attributes
+    ----------
+    path : Path
+        Under which it was found; another file may have this name by now.
+    descriptor : int
+    state : FileState
+        When it was opened.
+    """
+
+    path: Path
+    descriptor: int
+    state: FileState
+
+    @property
+    def size(self) -> int:
+        """Size when it was opened, bytes."""
+        return self.state[1]
+
+    @property
+    def unchanged(self) -> bool:
+        """Whether it is still as it was when it was opened."""
+        return state_of(os.fstat(self.descriptor)) == self.state
+
+    def mapped(self) -> NDArray[np.uint8]:
+        """Map its bytes, read-only."""
+        with open(self.descriptor, "rb", closefd=False) as file:
+            return np.memmap(file, dtype=np.uint8, mode="r")
+
+
+def state_of(status: os.stat_result) -> FileState:
+    """Tell this version of a file from others."""
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def why_not_regular(path: Path) -> str | None:
+    """Say in words what is no regular file; None for one, after symbolic links, and for what is missing.
+
+    Raises
+    ------
+    OSError
+        When the file cannot be looked at.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return "is a symbolic link to nothing" if path.is_symlink() else None
+    if stat.S_ISREG(mode):
+        return None
+    kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}
+    return f"is {kinds.get(stat.S_IFMT(mode), 'a device')}"
+
+
+@contextmanager
+def open_table_file(path: Path) -> Iterator[OpenFile]:
+    """Open a file that may be a table. Pipes, sockets and devices are not opened, as that may wait for ever.
+
+    Raises
+    ------
+    TableError
+        When there is none, or it may not be read.
+    NotATableError
+        When it is no regular file, or none of HDF5.
+    """
+    descriptor = _open(path)
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode) or not has_signature(descriptor, status.st_size):
+            raise NotATableError(
+                f"{path} is not a rayfix table (not an HDF5 file); give a file that 'rayfix build' wrote"
+            )
+        yield OpenFile(path=path, descriptor=descriptor, state=state_of(status))
+    finally:
+        os.close(descriptor)
+
+
+def _open(path: Path) -> int:
+    try:
+        if (what := why_not_regular(path)) is not None:
+            raise NotATableError(f"{path} {what} and not an HDF5 file; give a file that 'rayfix build' wrote")
+        return os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except (FileNotFoundError, NotADirectoryError):
+        raise TableError(f"there is no table at {path}; build one with 'rayfix build SITE.toml -o {path}'") from None
+    except PermissionError:
+        raise TableError(f"{path} cannot be read; ask its owner for the right to read it") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise TableError(f"{path} cannot be opened ({reason}); give the name of a table") from error
+
+
+def has_signature(descriptor: int, size: int) -> bool:
+    """Whether a file says that it is one of HDF5: at its beginning, or after 512 bytes and powers of two of that."""
+    place = 0
+    while place < size:
+        if os.pread(descriptor, len(_SIGNATURE), place) == _SIGNATURE:
+            return True
+        place = max(512, 2 * place)
+    return False

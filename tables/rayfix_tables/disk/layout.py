@@ -1,0 +1,291 @@
+"""What a table's file holds and where: all that HDF5 is needed for, refused where it is not as rayfix writes it.
+
+Whoever has the layout reads the arrays from the mapped file, without HDF5. The layout is small and can be sent from the
+process that read it (see :mod:`rayfix_tables.checking`) to those that answer from the table: a damaged file can crash
+HDF5 or hold it for ever.
+"""
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_tables.disk.files import OpenFile
+from rayfix_tables.disk.schema import CELL_CHANGE, FORMAT, FORMAT_VERSION, LEVEL_DATASETS, LOG_BALANCE, SCENE_DATASETS
+from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError
+
+_MOST_ATTRIBUTES = 64  # of one object; a station has 14
+_LEAST_OBJECT_BYTES = 16
+_LONGEST_ARRAY = 1024  # of an attribute; the coverage of a station is the longest
+_STATION = re.compile(r"stations/[^/]+\Z")
+_LEVEL = re.compile(r"stations/[^/]+/levels/(0|[1-9][0-9]{0,3})\Z")
+_OF_LEVELS = {**LEVEL_DATASETS, "log_balance": LOG_BALANCE, "cell_change": CELL_CHANGE}
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredArray:
+    """Where a dataset lies in the file.
+
+    Attributes
+    ----------
+    offset : int
+        From the beginning of the file, bytes; 0 where there is nothing.
+    shape : tuple of int
+    """
+
+    offset: int
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileLayout:
+    """The groups, attributes and datasets of a table's file, by their paths; that of the root is ``""``."""
+
+    attributes: dict[str, dict[str, Any]]
+    datasets: dict[str, StoredArray]
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the layout as JSON-compatible data."""
+        datasets = {path: [stored.offset, list(stored.shape)] for path, stored in self.datasets.items()}
+        return {"attributes": self.attributes, "datasets": datasets}
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> "FileLayout":
+        """Read what :meth:`to_document` wrote."""
+        stored = document["datasets"].items()
+        datasets = {path: StoredArray(offset=offset, shape=tuple(shape)) for path, (offset, shape) in stored}
+        return cls(attributes=document["attributes"], datasets=datasets)
+
+    def array(self, path: str, mapped: NDArray[np.uint8]) -> NDArray[Any]:
+        """View of a dataset in the mapped file."""
+        stored, dtype = self.datasets[path], dataset_kind(path)[0]
+        num_bytes = math.prod(stored.shape) * dtype.itemsize
+        if num_bytes == 0:
+            return np.zeros(stored.shape, dtype)
+        if stored.offset < 0 or stored.offset + num_bytes > mapped.size:
+            raise ValueError(f"{path} is not whole")
+        raw = mapped[stored.offset : stored.offset + num_bytes]
+        return raw.view(np.ndarray).view(dtype).reshape(stored.shape)
+
+
+def dataset_kind(path: str) -> tuple[np.dtype[Any], int]:
+    """Type and number of axes of the dataset of a path.
+
+    Raises
+    ------
+    ValueError
+        When a table has no such dataset.
+    """
+    group, _, name = path.rpartition("/")
+    if path in SCENE_DATASETS:
+        kind = SCENE_DATASETS[path]
+    elif _LEVEL.match(group) and name in _OF_LEVELS:
+        kind = _OF_LEVELS[name]
+    else:
+        raise ValueError(f"{shown(path)} does not belong to a table")
+    return np.dtype(kind[0]), kind[1]
+
+
+def shown(text: str) -> str:
+    """Text of a file as it can be said in a line."""
+    return text if text.isprintable() and len(text) <= 100 else ascii(text[:100])
+
+
+@contextmanager
+def damage_reported(path: Path) -> Iterator[None]:
+    """Say in one line what the readers make of a damaged file.
+
+    A byte changed among the file's own administration shows as any of these: HDF5 raises OSError, KeyError or
+    RuntimeError, and what it reads nevertheless may have any type.
+    """
+    try:
+        yield
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        MemoryError,
+        OSError,
+        RuntimeError,
+        SystemError,
+        TypeError,
+        ValueError,
+    ) as error:
+        raise CorruptTableError(
+            f"{path} is damaged: {_one_line(error)}; restore it from a copy or build it again"
+        ) from error
+
+
+def read_layout(opened: OpenFile) -> FileLayout:
+    """Read the layout of a file with HDF5. Call it within :func:`damage_reported`.
+
+    Links, filters, chunks, virtual and external storage, members that a table does not have, and shapes that the file
+    has no room for are refused before any of it is read.
+
+    Raises
+    ------
+    NotATableError
+        When it is another program's file.
+    FormatVersionError
+        When another version of rayfix wrote it.
+    ValueError
+        When it is not as rayfix writes it.
+    """
+    path = opened.path
+    # By its descriptor: another file may have its name by now.
+    with h5py.File(f"/dev/fd/{opened.descriptor}", "r") as file:
+        reader = _Reader(size=opened.size)
+        root = reader.attributes_of(file.id, "")
+        if root.get("format") != FORMAT:
+            raise NotATableError(
+                f"{path} is an HDF5 file but not a rayfix table; give a file that 'rayfix build' wrote"
+            )
+        version = root.get("format_version")
+        if version != FORMAT_VERSION or isinstance(version, bool):
+            raise FormatVersionError(
+                f"{path} has table format {version}, this rayfix reads format {FORMAT_VERSION}; build the table again "
+                "with this version, or install the version that wrote it"
+            )
+        reader.read_group(file["/"].id, "")
+        return FileLayout(attributes=reader.attributes, datasets=reader.datasets)
+
+
+@dataclass(kw_only=True)
+class _Reader:
+    """Reads the objects of a file, as far as the file's size allows.
+
+    Attributes
+    ----------
+    size : int
+        Of the file, bytes; what the objects say that they hold must not be more.
+    """
+
+    size: int
+    attributes: dict[str, dict[str, Any]] = field(default_factory=dict)
+    datasets: dict[str, StoredArray] = field(default_factory=dict)
+    _array_bytes: int = 0
+    _text_bytes: int = 0
+    _addresses: set[int] = field(default_factory=set)
+
+    def read_group(self, group: h5py.h5g.GroupID, path: str) -> None:
+        """Read all that is under a group."""
+        self.attributes_of(group, path)
+        for name in self._members(group, path):
+            child = f"{path}/{name}" if path else name
+            identifier = h5py.h5o.open(group, name.encode())
+            if isinstance(identifier, h5py.h5d.DatasetID):
+                self._read_dataset(identifier, child)
+            elif isinstance(identifier, h5py.h5g.GroupID) and _is_group(child):
+                self.read_group(identifier, child)
+            else:
+                raise ValueError(f"{shown(child)} does not belong to a table")
+
+    def _members(self, group: h5py.h5g.GroupID, path: str) -> list[str]:
+        found: list[tuple[bytes, int, Any]] = []
+
+        most = self.size // _LEAST_OBJECT_BYTES
+
+        def visit(name: bytes, info: Any) -> bool | None:
+            # What is raised here, h5py does not report as it is; what is returned ends the search.
+            found.append((name, info.type, info.u))
+            return True if len(found) > most else None
+
+        group.links.iterate(visit, info=True)
+        if len(found) > most:
+            raise ValueError(f"{shown(path or '/')} has more members than the file has room for")
+        names = []
+        for raw, kind, address in found:
+            name = raw.decode("utf-8")
+            child = f"{path}/{name}" if path else name
+            if kind != h5py.h5l.TYPE_HARD:
+                raise ValueError(f"{shown(child)} is a link; a table has none")
+            if address in self._addresses:
+                raise ValueError(f"{shown(child)} is in the file twice")
+            self._addresses.add(address)
+            names.append(name)
+        return names
+
+    def _read_dataset(self, dataset: h5py.h5d.DatasetID, path: str) -> None:
+        dtype, ndim = dataset_kind(path)
+        plan, space = dataset.get_create_plist(), dataset.get_space()
+        if plan.get_layout() != h5py.h5d.CONTIGUOUS or plan.get_external_count() or plan.get_nfilters():
+            raise ValueError(f"{path} is not stored in one piece, without a filter")
+        if space.get_simple_extent_type() != h5py.h5s.SIMPLE:
+            raise ValueError(f"{path} is no array")
+        shape = tuple(int(length) for length in space.get_simple_extent_dims())
+        if not dataset.get_type().equal(h5py.h5t.py_create(dtype)) or len(shape) != ndim:
+            raise ValueError(f"{path} is {dataset.dtype} with {len(shape)} axes, not {dtype} with {ndim}")
+        num_bytes = math.prod(shape) * dtype.itemsize
+        offset = dataset.get_offset() if num_bytes else 0
+        self._array_bytes += num_bytes
+        if offset is None or max(*shape, self._array_bytes, offset + num_bytes) > self.size:
+            raise ValueError(f"{path} is not whole")
+        self.datasets[path] = StoredArray(offset=offset, shape=shape)
+        self.attributes_of(dataset, path)
+
+    def attributes_of(self, identifier: Any, path: str) -> dict[str, Any]:
+        """Read the attributes of an object: texts, numbers, and short rows of numbers."""
+        if path in self.attributes:
+            return self.attributes[path]
+        count = h5py.h5a.get_num_attrs(identifier)
+        if count > _MOST_ATTRIBUTES:
+            raise ValueError(f"{shown(path) or 'the file'} has {count} attributes")
+        found: dict[str, Any] = {}
+        for index in range(count):
+            attribute = h5py.h5a.open(identifier, index=index)
+            found[attribute.name.decode()] = self._value(attribute, f"{path}@{attribute.name.decode()}")
+        self.attributes[path] = found
+        return found
+
+    def _value(self, attribute: h5py.h5a.AttrID, name: str) -> Any:
+        kind, space = attribute.get_type(), attribute.get_space()
+        is_text = isinstance(kind, h5py.h5t.TypeStringID) and kind.is_variable_str()
+        is_number = isinstance(kind, h5py.h5t.TypeIntegerID | h5py.h5t.TypeFloatID) and kind.get_size() <= 8
+        extent = space.get_simple_extent_type()
+        scalar = extent == h5py.h5s.SCALAR
+        row = extent == h5py.h5s.SIMPLE and space.get_simple_extent_ndims() == 1
+        if not (is_text and scalar) and not (is_number and (scalar or row)):
+            raise ValueError(f"{shown(name)} is no text and no number")
+        if space.get_simple_extent_npoints() > _LONGEST_ARRAY or kind.get_size() > self.size:
+            raise ValueError(f"{shown(name)} is too long")
+        if is_text:
+            text = _text(attribute)
+            self._text_bytes += len(text)
+            if self._text_bytes > self.size:
+                raise ValueError(f"{shown(name)} is too long")
+            return text
+        values = np.empty(attribute.shape, attribute.dtype)
+        attribute.read(values)
+        if not np.all(np.isfinite(values)):
+            raise ValueError(f"{shown(name)} is not finite")
+        return values.tolist()
+
+
+def _is_group(path: str) -> bool:
+    """Whether a table may have such a group."""
+    return (
+        path in ("scene", "stations")
+        or _STATION.match(path) is not None
+        or (path.endswith("/levels") and _STATION.match(path.removesuffix("/levels")) is not None)
+        or _LEVEL.match(path) is not None
+    )
+
+
+def _text(attribute: h5py.h5a.AttrID) -> str:
+    """Text of an attribute. One that is not Unicode cannot be written into answers."""
+    values = np.empty((), attribute.dtype)
+    attribute.read(values)
+    value: Any = values[()]
+    return value.decode("utf-8") if isinstance(value, bytes) else str(value).encode("utf-8").decode("utf-8")
+
+
+def _one_line(error: BaseException) -> str:
+    text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+    return shown(text.splitlines()[0]) if text.strip() else type(error).__name__

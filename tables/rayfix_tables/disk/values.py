@@ -1,0 +1,67 @@
+"""Values that the kernels rely on: numbers that are finite, and indices of what is there."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_AT_A_TIME = 1 << 20
+"""Numbers that are looked at together, so that no copy is as large as the table."""
+
+
+def check_finite(arrays: Iterable[tuple[str, NDArray[Any]]]) -> None:
+    """Check that no array has a number that is not finite; a cell's mass of zero has a logarithm of -inf.
+
+    Raises
+    ------
+    ValueError
+        When one has; the message names it.
+    """
+    for name, array in arrays:
+        if array.dtype.kind != "f":
+            continue
+        flat, empty_cells = array.reshape(-1), name.endswith("/cell_log_mass")
+        for begin in range(0, flat.size, _AT_A_TIME):
+            part = flat[begin : begin + _AT_A_TIME]
+            good = np.isfinite(part) | (part == -np.inf) if empty_cells else np.isfinite(part)
+            if not good.all():
+                raise ValueError(f"{name} has numbers that are not finite")
+
+
+def check_range(name: str, array: NDArray[Any], least: int, most: int) -> None:
+    """Check that all numbers of an array of integers are in a range.
+
+    Raises
+    ------
+    ValueError
+        When one is not; the message names the array.
+    """
+    if array.size and not (least <= int(array.min()) and int(array.max()) <= most):
+        raise ValueError(f"{name} has numbers that are not from {least} to {most}")
+
+
+def check_rings(name: str, ring_cells: NDArray[np.int64], num_cells: int) -> None:
+    """Check that the rings of a grid have cells, and no more than these.
+
+    Raises
+    ------
+    ValueError
+        When they have not; the message names the array.
+    """
+    if not len(ring_cells):
+        raise ValueError(f"{name} has no ring")
+    check_range(name, ring_cells, 1, max(num_cells, 1))
+
+
+def check_offsets(name: str, offsets: NDArray[np.int64], count: int) -> None:
+    """Check that offsets ascend from 0 to a number of components.
+
+    Raises
+    ------
+    ValueError
+        When they do not; the message names the array.
+    """
+    ends = len(offsets) > 0 and int(offsets[0]) == 0 and int(offsets[-1]) == count
+    if not ends or np.any(offsets[1:] < offsets[:-1]):  # differences of what is damaged may overflow
+        raise ValueError(f"{name} do not run from 0 to {count}")
