@@ -22,6 +22,7 @@ from rayfix_service.fusion.observations import Observation
 from rayfix_service.fusion.prior import Prior
 from rayfix_service.fusion.report import GAUSSIAN, ErrorModel
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.fusion.stopping import NEVER
 from rayfix_tables.conditioning import condition_on_angle
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
@@ -244,7 +245,7 @@ def extend_beam(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Products by the kernel, the best first."""
     columns = natural.pack(*hypotheses), natural.pack(*factor)
-    parent, choice, score = beam_kernels.extend_beam(*columns, width, hopeless, LOG_VOLUME, LOG_RANGE)
+    parent, choice, score = beam_kernels.extend_beam(*columns, width, hopeless, LOG_VOLUME, LOG_RANGE, NEVER.cell)
     order = np.argsort(-score)
     return parent[order], choice[order], score[order]
 

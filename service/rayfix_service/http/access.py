@@ -59,13 +59,30 @@ class Access:
                 )
         scope[_CLIENT] = client
         if self._limit is not None and scope["type"] == "http" and scope["method"] == "POST":
-            if (seconds := self._limit.seconds_to_wait(client)) > 0.0:
-                raise ProblemError(
-                    TOO_MANY_REQUESTS,
-                    "this key has sent more reports than it may; try again after the seconds of Retry-After",
-                    headers={"Retry-After": str(math.ceil(seconds))},
-                )
-            self._limit.charge(client)
+            _charge(self._limit, client)
+
+
+def charge_report(connection: HTTPConnection) -> None:
+    """Count a request that is no POST as a report, for what takes as long as one.
+
+    Raises
+    ------
+    ProblemError
+        When the client has sent more than it may.
+    """
+    limit: RateLimit | None = connection.app.state.rate_limit
+    if limit is not None:
+        _charge(limit, client_of(connection))
+
+
+def _charge(limit: RateLimit, client: str) -> None:
+    if (seconds := limit.seconds_to_wait(client)) > 0.0:
+        raise ProblemError(
+            TOO_MANY_REQUESTS,
+            "this key has sent more reports than it may; try again after the seconds of Retry-After",
+            headers={"Retry-After": str(math.ceil(seconds))},
+        )
+    limit.charge(client)
 
 
 def client_of(connection: HTTPConnection) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, cast
 
 from fastapi import Depends
 from pydantic_core import from_json, to_json
@@ -16,10 +16,12 @@ from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.omlox_hub import OmloxHub
 from rayfix_service.fusion.locator import Fused
 from rayfix_service.fusion.report import Fix, Report
+from rayfix_service.fusion.stopping import NEVER
 from rayfix_service.http.feed import FixFeed
 from rayfix_service.http.metrics import Metrics
 from rayfix_service.http.problems import ProblemError, internal_problem, problem_document, report_problem
-from rayfix_service.http.slow_fixes import SlowFixes, is_slow
+from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.http.slow_fixes import SlowFixes, Stoppable
 from rayfix_service.http.tables import ServedTable
 from rayfix_service.http.wanted import Wanted
 from rayfix_service.tracking.tracker import TrackedPosition
@@ -79,12 +81,27 @@ class Located(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Answerer:
-    """What answers reports: the figures that it adds to, the feed and hub to tell, threads for slow ones."""
+    """What answers reports.
+
+    Attributes
+    ----------
+    metrics : Metrics
+        To add to.
+    feed : FixFeed
+        To tell of fixes.
+    slow_fixes : SlowFixes
+        Threads for what takes longer, by its estimate, than ``quick_seconds``.
+    hub : OmloxHub or None
+        To tell of positions.
+    quick_seconds : float
+        What a fix may take on the event loop.
+    """
 
     metrics: Metrics
     feed: FixFeed
     slow_fixes: SlowFixes
     hub: OmloxHub | None
+    quick_seconds: float = ServiceSettings.quick_fix_seconds
 
     async def answer(self, table: ServedTable, incoming: Incoming, wanted: Wanted) -> dict[str, Any]:
         """Locate a report with a table and write the answer as wanted.
@@ -99,8 +116,9 @@ class Answerer:
     async def locate(self, table: ServedTable, incoming: Incoming, wanted: Wanted) -> Located:
         """Locate a report with a table, and follow its target if that is wanted.
 
-        A fix with an angle takes less than a millisecond or a few, right on the event loop. In the thread pool that
-        FastAPI has for "def" such fixes would wait for each other's GIL; more worker processes use more cores.
+        A fix that takes less than a millisecond or a few by its estimate, as most do, is made right on the event loop.
+        In the thread pool that FastAPI has for "def" such fixes would wait for each other's GIL; more worker processes
+        use more cores. Others go to the threads for slow fixes.
 
         Raises
         ------
@@ -110,10 +128,13 @@ class Answerer:
             When the fix is slow and the service too busy.
         """
         report = incoming.report
-        locate: Callable[[Report], Fix | Fused] = table.locator.fuse if wanted.follows(report) else table.locator.locate
+        locator = table.locator
+        locate = cast("Stoppable[Report, Fix | Fused]", locator.fuse if wanted.follows(report) else locator.locate)
+        quick = table.locator.seconds(report) <= self.quick_seconds
         start = perf_counter()
         try:
-            found = await self.slow_fixes.locate(locate, report) if is_slow(report) else locate(report)
+            found: Fix | Fused
+            found = locate(report, stop=NEVER) if quick else await self.slow_fixes.locate(locate, report)
             seconds = perf_counter() - start
             fix = found.fix if isinstance(found, Fused) else found
             self.metrics.fix_done(fix, seconds)

@@ -28,6 +28,9 @@ class ServiceSettings:
     burst_seconds : float
     cors_origins : tuple of str
         Origins such as ``https://maps.example.com`` whose pages may call the service from a browser.
+    quick_fix_seconds : float
+        A fix that takes no longer than this, by an estimate from its report, is made on the event loop; the others, the
+        slow ones, are made in threads.
     fix_seconds : float
         Time limit of a slow fix.
     slow_fix_threads, slow_fixes_waiting : int
@@ -52,6 +55,7 @@ class ServiceSettings:
     reports_per_second: float | None = None
     burst_seconds: float = 2.0
     cors_origins: tuple[str, ...] = ()
+    quick_fix_seconds: float = 0.005
     fix_seconds: float = 10.0
     slow_fix_threads: int = 2
     slow_fixes_waiting: int = 32

@@ -1,8 +1,7 @@
 """Routes that make reports and show whole posteriors."""
 
-from functools import partial
 from time import perf_counter
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from fastapi import APIRouter, Request
@@ -10,6 +9,7 @@ from fastapi.responses import JSONResponse
 
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.report import Report
+from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_service.http.dependencies import ReportBody, TableDep
 from rayfix_service.http.examples import REPORT_EXAMPLES
 from rayfix_service.http.outputs import POSITION_PROBLEMS, request_body
@@ -21,7 +21,7 @@ from rayfix_service.http.problems import (
     ProblemError,
     problem_responses,
 )
-from rayfix_service.http.slow_fixes import SlowFixes
+from rayfix_service.http.slow_fixes import Asked_contra, SlowFixes, Stoppable
 from rayfix_service.web.documents import (
     PosteriorDocument,
     SimulationDocument,
@@ -76,7 +76,7 @@ async def post_simulation(request: Request, served: TableDep, body: ReportBody) 
         )
     wanted = parse_simulation(body)
     slow_fixes: SlowFixes = request.app.state.slow_fixes
-    return JSONResponse(await slow_fixes.locate(partial(_simulate_and_locate, served.locator), wanted))
+    return JSONResponse(await slow_fixes.locate(_on(served.locator, _simulate_and_locate), wanted))
 
 
 @router.post(
@@ -89,7 +89,7 @@ async def post_simulation(request: Request, served: TableDep, body: ReportBody) 
 async def post_posterior(request: Request, served: TableDep, body: ReportBody) -> JSONResponse:
     """Give the Gaussians of the posterior and positions drawn from it, for pictures."""
     slow_fixes: SlowFixes = request.app.state.slow_fixes
-    return JSONResponse(await slow_fixes.locate(partial(picture_posterior, served.locator), parse_report(body)))
+    return JSONResponse(await slow_fixes.locate(_on(served.locator, picture_posterior), parse_report(body)))
 
 
 def viewer_settings(table: Table, *, simulation: bool) -> ViewerSettings:
@@ -100,13 +100,26 @@ def viewer_settings(table: Table, *, simulation: bool) -> ViewerSettings:
     )
 
 
-def picture_posterior(locator: Locator, report: Report) -> dict[str, Any]:
+def picture_posterior(locator: Locator, report: Report, *, stop: Stop = NEVER) -> dict[str, Any]:
     """Build what :class:`PosteriorDocument` describes; the same report gives the same samples."""
-    posterior = locator.posterior(report)
-    return posterior_document(posterior, posterior.sample(_SAMPLES, np.random.default_rng(0)))
+    posterior = locator.posterior(report, stop=stop)
+    return posterior_document(posterior, posterior.sample(_SAMPLES, np.random.default_rng(0), stop=stop))
 
 
-def _simulate_and_locate(locator: Locator, wanted: SimulationRequest) -> dict[str, Any]:
+class _Work(Protocol[Asked_contra]):
+    """What a route does with a locator."""
+
+    def __call__(self, locator: Locator, asked: Asked_contra, /, *, stop: Stop) -> dict[str, Any]: ...
+
+
+def _on(locator: Locator, work: _Work[Asked_contra]) -> Stoppable[Asked_contra, dict[str, Any]]:
+    def do(asked: Asked_contra, /, *, stop: Stop) -> dict[str, Any]:
+        return work(locator, asked, stop=stop)
+
+    return do
+
+
+def _simulate_and_locate(locator: Locator, wanted: SimulationRequest, *, stop: Stop) -> dict[str, Any]:
     paths, measurements = simulate(
         locator.table,
         wanted.position,
@@ -117,7 +130,7 @@ def _simulate_and_locate(locator: Locator, wanted: SimulationRequest) -> dict[st
     )
     report = {"target_id": wanted.target_id, "measurements": measurements}
     begin = perf_counter()
-    fix = locator.locate(parse_report(report))
+    fix = locator.locate(parse_report(report), stop=stop)
     return {
         "report": report,
         "fix": fix_to_document(fix, perf_counter() - begin),
