@@ -16,6 +16,7 @@ with needs_extra("service"):
     from rayfix_service.fusion.posterior.fix import Fix
     from rayfix_service.fusion.posterior.posterior import Posterior
     from rayfix_service.fusion.settings import FusionSettings
+    from rayfix_service.fusion.stopping import NEVER, Stop
     from rayfix_service.measuring.impulse_response import range_from_impulse_response
     from rayfix_service.measuring.ranging import range_from_round_trip, range_from_rssi, range_from_times
     from rayfix_service.tracking.settings import TrackingSettings
@@ -92,20 +93,24 @@ class Locator(_Locator):
             raise TypeError(f"a Locator needs an open table, not {table!r}; open the file with rayfix.Table.open(path)")
         super().__init__(table, settings)
 
-    def locate(self, report: Report | Mapping[str, Any]) -> Fix:
+    def locate(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Fix:
         """Fuse the measurements of a report.
 
         Parameters
         ----------
         report : Report or mapping
             A mapping has the form of the JSON that ``POST /v1/positions`` takes.
+        stop : rayfix_service.fusion.stopping.Stop, optional
+            Ends it early, once another thread calls ``stop.set()``.
 
         Raises
         ------
         ReportError
             When the report cannot be used; its ``path`` names the field.
+        FixStoppedError
+            When it was stopped.
         """
-        return super().locate(report if isinstance(report, Report) else parse_report(report))
+        return super().locate(report if isinstance(report, Report) else parse_report(report), stop=stop)
 
     def locate_batch(self, reports: Sequence[Report | Mapping[str, Any]], *, jobs: int = -1) -> list[Fix | ReportError]:
         """Fuse the measurements of many reports, on several processor cores.
@@ -132,25 +137,29 @@ class Locator(_Locator):
         """
         return locate_batch(self, reports, jobs=jobs)
 
-    def posterior(self, report: Report | Mapping[str, Any]) -> Posterior:
+    def posterior(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Posterior:
         """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.
 
         Parameters
         ----------
         report : Report or mapping
             As of :meth:`locate`, and so are the errors.
+        stop : rayfix_service.fusion.stopping.Stop, optional
+            As of :meth:`locate`.
         """
-        return super().posterior(report if isinstance(report, Report) else parse_report(report))
+        return super().posterior(report if isinstance(report, Report) else parse_report(report), stop=stop)
 
-    def fuse(self, report: Report | Mapping[str, Any]) -> Fused:
+    def fuse(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Fused:
         """Fuse the measurements of a report and keep what its fix was made of, for :class:`Tracker`.
 
         Parameters
         ----------
         report : Report or mapping
             As of :meth:`locate`, and so are the errors.
+        stop : rayfix_service.fusion.stopping.Stop, optional
+            As of :meth:`locate`.
         """
-        return super().fuse(report if isinstance(report, Report) else parse_report(report))
+        return super().fuse(report if isinstance(report, Report) else parse_report(report), stop=stop)
 
 
 class Tracker(_Tracker):

@@ -76,6 +76,7 @@ class FixAnswer:
     table_id: str
     compute_ms: float
     track: TrackAnswer | None
+    simplified: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,6 +148,7 @@ def fix_answer(document: Mapping[str, Any]) -> FixAnswer:
         table_id=document["table_id"],
         compute_ms=float(document["compute_ms"]),
         track=None if track is None else _track(track),
+        simplified=tuple(document.get("simplified", ())),
     )
 
 

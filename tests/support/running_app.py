@@ -86,6 +86,11 @@ class RunningApp:
         finally:
             self._runner.close()
 
+    @property
+    def state(self) -> Any:
+        """What the application keeps."""
+        return self._app.state
+
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
         """Run a coroutine in the application's loop."""
         return self._runner.run(coroutine)

@@ -12,13 +12,27 @@ from rayfix_service.fusion.posterior.fixes import Product, make_fix
 from rayfix_service.fusion.posterior.points import DrawnPoints
 from rayfix_service.fusion.posterior.posterior import Posterior, make_posterior
 from rayfix_service.fusion.product.beam import Hypotheses, multiply
+from rayfix_service.fusion.product.cost import CostEstimate
 from rayfix_service.fusion.product.factors import Factor, make_factor
 from rayfix_service.fusion.product.prior import Prior, even_prior, height_prior
 from rayfix_service.fusion.product.station_mixture import HeardStation
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.table import Table
 
 _NO_RAYS = "no ray of station '{}' comes from that direction"
+
+_TOO_MUCH = "left out: the measurements before it need all the work that one report may take; send fewer at once"
+
+_FEWER_ERRORS = (
+    "of {} paths the less probable combinations of errors were left out, since there were too many; send fewer "
+    "measurements of one path whose errors are heavy-tailed or log-normal"
+)
+
+_FEWER_HYPOTHESES = (
+    "less probable hypotheses were left out, since there were too many products to form; send fewer measurements, or "
+    "time differences that are connected"
+)
 
 
 class Locator:
@@ -35,39 +49,59 @@ class Locator:
         self.settings = settings or FusionSettings()
         self._even_prior = even_prior(table.scene.free_space)
         self._stations = {name: HeardStation(part) for name, part in table.parts.items()}
+        largest = max((part.levels[-1].num_components for part in table.parts.values()), default=0)
+        self._most_considered = max(self.settings.most_considered, self.settings.considered_tables * largest)
+        self._cost = CostEstimate(self._stations, self.settings)
 
-    def locate(self, report: Report) -> Fix:
+    def locate(self, report: Report, *, stop: Stop = NEVER) -> Fix:
         """Fuse the measurements of a report.
 
+        Parameters
+        ----------
+        report : Report
+        stop : Stop
+            Ends it early, from another thread.
+
         Raises
         ------
         ReportError
             When the report cannot be used; its ``path`` names the field.
+        FixStoppedError
+            When it was stopped.
         """
-        return make_fix(report, self._product(report), self.table, self.settings)
+        return make_fix(report, self._product(report, stop), self.table, self.settings, stop)
 
-    def fuse(self, report: Report) -> "Fused":
+    def fuse(self, report: Report, *, stop: Stop = NEVER) -> "Fused":
         """Locate a report and keep what its fix was made of, for filters that go on with it.
 
-        Raises
-        ------
-        ReportError
-            When the report cannot be used; its ``path`` names the field.
+        Parameters
+        ----------
+        report : Report
+        stop : Stop
+            As of :meth:`locate`, and so are the errors.
         """
-        product = self._product(report)
-        fix = make_fix(report, product, self.table, self.settings)
+        product = self._product(report, stop)
+        fix = make_fix(report, product, self.table, self.settings, stop)
         return Fused(fix=fix, hypotheses=product.hypotheses, prior=product.prior)
 
-    def posterior(self, report: Report) -> Posterior:
+    def posterior(self, report: Report, *, stop: Stop = NEVER) -> Posterior:
         """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.
 
-        Raises
-        ------
-        ReportError
-            When the report cannot be used; its ``path`` names the field.
+        Parameters
+        ----------
+        report : Report
+        stop : Stop
+            As of :meth:`locate`, and so are the errors.
         """
-        product = self._product(report)
-        return make_posterior(product.hypotheses, product.prior, self.table.scene.free_space)
+        product = self._product(report, stop)
+        return make_posterior(product.hypotheses, product.prior, self.table.scene.free_space, stop)
+
+    def seconds(self, report: Report) -> float:
+        """Estimate how long a fix of a report will take, s, within some microseconds.
+
+        It tells quick fixes from slow ones and is infinite for what is slow in any case.
+        """
+        return self._cost.seconds(report)
 
     def warm_up(self) -> None:
         """Compile the kernels and prepare reports without angles, by locating a report of each kind."""
@@ -83,13 +117,13 @@ class Locator:
         regions.upright_ellipsoid(0.5)
         _ = regions.accuracies(0.5).ellipsoid.semi_axes
 
-    def _product(self, report: Report) -> Product:
+    def _product(self, report: Report, stop: Stop) -> Product:
         """Multiply what the measurements say."""
         sorted_report = sort_report(report, self.table.site)
         free_space = self.table.scene.free_space
         prior = self._even_prior if report.height is None else height_prior(report.height, free_space)
         unused = dict(sorted_report.unused)
-        observations, factors = self._factors(sorted_report, prior, unused)
+        observations, factors = self._factors(sorted_report, prior, unused, stop)
         hypotheses = None
         if factors:
             hypotheses = multiply(
@@ -98,30 +132,48 @@ class Locator:
                 prior=prior,
                 width=self.settings.beam_width,
                 max_divergence=self.settings.max_divergence,
+                most_products=self.settings.most_products,
+                stop=stop,
             )
-        return Product(observations, unused, prior, hypotheses)
+        simplified = []
+        if bounded := sum([factor.omitted for factor in factors]):
+            simplified.append(_FEWER_ERRORS.format(bounded))
+        if hypotheses is not None and hypotheses.omitted:
+            simplified.append(_FEWER_HYPOTHESES)
+        return Product(observations, unused, prior, hypotheses, tuple(simplified))
 
     def _factors(
-        self, sorted_report: SortedReport, prior: Prior, unused: dict[int, str]
+        self, sorted_report: SortedReport, prior: Prior, unused: dict[int, str], stop: Stop
     ) -> tuple[list[Observation], list[Factor]]:
         """Factors of the observations that can contribute; why others cannot goes to ``unused``."""
         observations, factors = [], []
-        for observation in sorted_report.observations:
-            factor = make_factor(
-                observation,
-                self._stations[observation.station_id],
-                num_clocks=sorted_report.num_clocks,
-                max_path_length=self.table.site.max_path_length,
-                prior=prior,
-                settings=self.settings,
-            )
+        lost: dict[int, str] = {}
+        left, count = self._most_considered, len(sorted_report.observations)
+        for place, observation in enumerate(sorted_report.observations):
+            factor, reason = None, _TOO_MUCH
+            if left > 0:
+                factor = make_factor(
+                    observation,
+                    self._stations[observation.station_id],
+                    num_clocks=sorted_report.num_clocks,
+                    max_path_length=self.table.site.max_path_length,
+                    prior=prior,
+                    settings=self.settings,
+                    most_considered=left // (count - place),
+                    stop=stop,
+                )
+                reason = _NO_RAYS.format(observation.station_id)
             if factor is not None:
+                left -= factor.considered
                 observations.append(observation)
                 factors.append(factor)
                 continue
             for index in (observation.angle_index, *observation.timing_indices):
                 if index is not None:
-                    unused[index] = _NO_RAYS.format(observation.station_id)
+                    unused[index] = reason
+            lost |= dict.fromkeys(observation.differences, reason)
+        # A time difference is of two paths, and says something as long as one of them does.
+        unused |= {n: lost[n] for n in lost.keys() - {n for o in observations for n in o.differences}}
         return observations, factors
 
 

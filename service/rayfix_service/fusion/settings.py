@@ -15,6 +15,16 @@ class FusionSettings:
         Least probability that a receiver's judgement whether a path is direct is wrong, however sure it seems.
     beam_width : int
         Hypotheses that are kept from one station to the next, before the like are merged.
+    most_alternatives : int
+        Alternatives that are kept of one path of the report, the most probable ones; with clocks, fewer.
+    most_considered : int
+        Alternatives that are looked at over all paths of a report, before the improbable are left out. Where the
+        combinations of errors that are not Gaussian make more, the less probable ones are left out. A table whose
+        stations have very many components allows for more: ``considered_tables`` times those of its largest.
+    considered_tables : int
+    most_products : int
+        Products of hypotheses and alternatives that a report may take; with clocks, each counts for more, as it takes
+        longer. Where there would be more, the less probable hypotheses are left out.
     max_divergence : float
         What merging two hypotheses may cost, nats.
     component_floor : float
@@ -33,6 +43,10 @@ class FusionSettings:
     outlier_probability: float = 0.01
     sight_error: float = 0.05
     beam_width: int = 2048
+    most_alternatives: int = 8192
+    most_considered: int = 2**23
+    considered_tables: int = 64
+    most_products: int = 2**28
     max_divergence: float = 5e-3
     component_floor: float = 1e-6
     hypothesis_floor: float = 1e-5

@@ -77,6 +77,9 @@ class ServiceSettings:
         Origins such as ``https://maps.example.com`` whose pages may call the service from a browser.
     hosts : tuple of str
         Names by which a service without keys may be called, besides loopback addresses; empty where any will do.
+    quick_fix_seconds : float
+        A fix that takes no longer than this, by an estimate from its report, is made on the event loop; the others, the
+        slow ones, are made in threads.
     fix_seconds : float
         Time limit of a slow fix.
     slow_fix_threads, slow_fixes_waiting : int
@@ -106,6 +109,7 @@ class ServiceSettings:
     burst_seconds: float = 2.0
     cors_origins: tuple[str, ...] = ()
     hosts: tuple[str, ...] = ()
+    quick_fix_seconds: float = 0.005
     fix_seconds: float = 10.0
     slow_fix_threads: int = 2
     slow_fixes_waiting: int = 32

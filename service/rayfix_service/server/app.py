@@ -156,7 +156,11 @@ def create_app(
             with on_stop_signal(stop):
                 async with open_hub(settings.hub, on_outcome=state.metrics.hub_told) as hub:
                     state.answerer = Answerer(
-                        metrics=state.metrics, feed=state.feed, slow_fixes=state.slow_fixes, hub=hub
+                        metrics=state.metrics,
+                        feed=state.feed,
+                        slow_fixes=state.slow_fixes,
+                        hub=hub,
+                        quick_seconds=settings.quick_fix_seconds,
                     )
                     if settings.runtime_folder is not None:
                         forget_dead_workers()

@@ -1,12 +1,23 @@
 """Routes of what the viewer shows: the scene, and what the table says of directions."""
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from rayfix_service.http.problems import INVALID_PARAMETER, NOT_FOUND, NOT_READY, ProblemError, problem_responses
+from rayfix_service.http.access.guard import charge_report
+from rayfix_service.http.answering.slow_work import SlowFixes
+from rayfix_service.http.problems import (
+    FIX_TIMEOUT,
+    INVALID_PARAMETER,
+    NOT_FOUND,
+    NOT_READY,
+    OVERLOADED,
+    TOO_MANY_REQUESTS,
+    ProblemError,
+    problem_responses,
+)
 from rayfix_service.http.routes.dependencies import TableDep
 from rayfix_service.web.documents import CoverageDocument, MixtureDocument, mixture_document
 from rayfix_service.web.glb import MEDIA_TYPE, write_glb
@@ -14,6 +25,11 @@ from rayfix_service.web.inspector import mass_by_reflections, view_direction
 from rayfix_tables.table import StationPart, Table
 
 router = APIRouter(prefix="/v1", tags=["viewer"])
+
+_COMPUTED = problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY, TOO_MANY_REQUESTS, OVERLOADED, FIX_TIMEOUT)
+
+_WIDEST_DEG = 30.0
+"""Most standard deviation of a direction whose mixture is told: six of it are all around."""
 
 StationId = Annotated[str, Path(max_length=128, description="the identifier of a station of the table")]
 
@@ -41,41 +57,52 @@ async def get_scene(request: Request, served: TableDep) -> Response:
     "/stations/{station_id}/mixture",
     summary="The mixture of a direction",
     response_model=MixtureDocument,
-    responses=problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY),
+    responses=_COMPUTED,
 )
 async def get_mixture(
+    request: Request,
     served: TableDep,
     station_id: StationId,
     azimuth_deg: Annotated[float, Query(ge=-180, le=360, allow_inf_nan=False, description="in the scene frame")],
     zenith_deg: Annotated[float, Query(ge=0, le=180, allow_inf_nan=False, description="in the scene frame")],
     stdev_deg: Annotated[
-        float, Query(ge=1e-3, le=90, allow_inf_nan=False, description="standard deviation of both angles")
+        float, Query(ge=1e-3, le=_WIDEST_DEG, allow_inf_nan=False, description="standard deviation of both angles")
     ] = 1.0,
     limit: Annotated[int, Query(ge=1, le=512, description="components to return")] = 64,
 ) -> JSONResponse:
-    """Look a measured direction up as the fusion does: level, cells, and the components conditioned on it."""
-    view = view_direction(
-        _part(served.locator.table, station_id),
-        math.remainder(math.radians(azimuth_deg), 2.0 * math.pi),
-        math.radians(zenith_deg),
-        math.radians(stdev_deg),
-        limit=limit,
-    )
-    return JSONResponse(mixture_document(station_id, view))
+    """Look a measured direction up as the fusion does: level, cells, and the components conditioned on it.
+
+    It counts as a report for the rate limit.
+    """
+    part = _part(served.locator.table, station_id)
+    azimuth = math.remainder(math.radians(azimuth_deg), 2.0 * math.pi)
+    zenith, stdev = math.radians(zenith_deg), math.radians(stdev_deg)
+
+    def view() -> dict[str, Any]:
+        return mixture_document(station_id, view_direction(part, azimuth, zenith, stdev, limit=limit))
+
+    charge_report(request)
+    slow_fixes: SlowFixes = request.app.state.slow_fixes
+    return JSONResponse(await slow_fixes.run(view))
 
 
 @router.get(
     "/stations/{station_id}/coverage",
     summary="How far reflections reach",
     response_model=CoverageDocument,
-    responses=problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY),
+    responses=_COMPUTED,
 )
 async def get_coverage(request: Request, served: TableDep, station_id: StationId) -> JSONResponse:
-    """Tell which share of the free space and of each level's mass belongs to how many reflections."""
+    """Tell which share of the free space and of each level's mass belongs to how many reflections.
+
+    It counts as a report for the rate limit.
+    """
     table = served.locator.table
     part = _part(table, station_id)
+    charge_report(request)
+    slow_fixes: SlowFixes = request.app.state.slow_fixes
     document = await request.app.state.per_table.get(
-        table.table_id, f"coverage of {station_id}", lambda: _coverage(station_id, part)
+        table.table_id, f"coverage of {station_id}", lambda: _coverage(station_id, part), run=slow_fixes.run
     )
     return JSONResponse(document)
 

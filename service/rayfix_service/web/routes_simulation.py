@@ -1,15 +1,15 @@
 """Routes that make reports and show whole posteriors."""
 
-from functools import partial
 from time import perf_counter
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse
 
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.http.answering.slow_work import SlowFixes
+from rayfix_service.fusion.stopping import Stop
+from rayfix_service.http.answering.slow_work import Asked_contra, SlowFixes, Stoppable
 from rayfix_service.http.openapi.examples import REPORT_EXAMPLES
 from rayfix_service.http.openapi.responses import POSITION_PROBLEMS, request_body
 from rayfix_service.http.problems import (
@@ -69,7 +69,7 @@ async def post_simulation(request: Request, served: TableDep, body: ReportBody) 
         )
     wanted = parse_simulation(body)
     slow_fixes: SlowFixes = request.app.state.slow_fixes
-    return JSONResponse(await slow_fixes.locate(partial(_simulate_and_locate, served.locator), wanted))
+    return JSONResponse(await slow_fixes.locate(_on(served.locator, _simulate_and_locate), wanted))
 
 
 @router.post(
@@ -82,10 +82,23 @@ async def post_simulation(request: Request, served: TableDep, body: ReportBody) 
 async def post_posterior(request: Request, served: TableDep, body: ReportBody) -> JSONResponse:
     """Give the Gaussians of the posterior and positions drawn from it, for pictures."""
     slow_fixes: SlowFixes = request.app.state.slow_fixes
-    return JSONResponse(await slow_fixes.locate(partial(picture_posterior, served.locator), parse_report(body)))
+    return JSONResponse(await slow_fixes.locate(_on(served.locator, picture_posterior), parse_report(body)))
 
 
-def _simulate_and_locate(locator: Locator, wanted: SimulationRequest) -> dict[str, Any]:
+class _Work(Protocol[Asked_contra]):
+    """What a route does with a locator."""
+
+    def __call__(self, locator: Locator, asked: Asked_contra, /, *, stop: Stop) -> dict[str, Any]: ...
+
+
+def _on(locator: Locator, work: _Work[Asked_contra]) -> Stoppable[Asked_contra, dict[str, Any]]:
+    def do(asked: Asked_contra, /, *, stop: Stop) -> dict[str, Any]:
+        return work(locator, asked, stop=stop)
+
+    return do
+
+
+def _simulate_and_locate(locator: Locator, wanted: SimulationRequest, *, stop: Stop) -> dict[str, Any]:
     paths, measurements = simulate(
         locator.table,
         wanted.position,
@@ -96,7 +109,7 @@ def _simulate_and_locate(locator: Locator, wanted: SimulationRequest) -> dict[st
     )
     report = {"target_id": wanted.target_id, "measurements": measurements}
     begin = perf_counter()
-    fix = locator.locate(parse_report(report))
+    fix = locator.locate(parse_report(report), stop=stop)
     return {
         "report": report,
         "fix": fix_to_document(fix, perf_counter() - begin),

@@ -1,7 +1,7 @@
 """Results that follow from a table alone and are worth keeping while it is served."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -20,11 +20,17 @@ class PerTable:
         self._most = most
         self._kept: dict[tuple[str, str], Any] = {}
 
-    async def get(self, table_id: str, name: str, compute: Callable[[], T]) -> T:
-        """Return a result, computed in a thread the first time."""
+    async def get(
+        self,
+        table_id: str,
+        name: str,
+        compute: Callable[[], T],
+        run: Callable[[Callable[[], T]], Awaitable[T]] = asyncio.to_thread,
+    ) -> T:
+        """Return a result, computed by ``run`` the first time, in a thread unless told otherwise."""
         key = (table_id, name)
         if key not in self._kept:
-            result = await asyncio.to_thread(compute)
+            result = await run(compute)
             while len(self._kept) >= self._most:
                 self._kept.pop(next(iter(self._kept)))
             self._kept[key] = result

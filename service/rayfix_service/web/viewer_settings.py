@@ -6,6 +6,7 @@ import numpy as np
 
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_service.web.documents import ViewerSettings, posterior_document
 from rayfix_tables.table import Table
 
@@ -24,7 +25,7 @@ def viewer_settings(table: Table, *, simulation: bool) -> ViewerSettings:
     )
 
 
-def picture_posterior(locator: Locator, report: Report) -> dict[str, Any]:
+def picture_posterior(locator: Locator, report: Report, *, stop: Stop = NEVER) -> dict[str, Any]:
     """Build what :class:`PosteriorDocument` describes; the same report gives the same samples."""
-    posterior = locator.posterior(report)
-    return posterior_document(posterior, posterior.sample(_SAMPLES, np.random.default_rng(0)))
+    posterior = locator.posterior(report, stop=stop)
+    return posterior_document(posterior, posterior.sample(_SAMPLES, np.random.default_rng(0), stop=stop))

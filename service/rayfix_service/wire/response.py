@@ -58,6 +58,11 @@ class FixDocument(BaseModel):
     )
     candidates: list[CandidateDocument] = Field(description="the position and its rivals, most probable first")
     measurements: list[OutcomeDocument]
+    simplified: list[str] = Field(
+        default=[],
+        description="what was worked out more coarsely than the report says, since the work for one report is bounded; "
+        "absent for nearly all reports",
+    )
     table_id: str
     compute_ms: float = Field(description="time the fix itself took, ms")
     track: TrackDocument | None = Field(
@@ -110,6 +115,8 @@ def fix_to_document(fix: Fix, compute_seconds: float, track: TrackedPosition | N
         "table_id": fix.table_id,
         "compute_ms": round(compute_seconds * 1e3, 3),
     }
+    if fix.simplified:
+        document["simplified"] = list(fix.simplified)
     if track is not None:
         document["track"] = track_to_document(track, confidence)
     return document

@@ -23,6 +23,7 @@ from rayfix_service.fusion.product.factors import make_factor
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.product.station_mixture import HeardStation
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.fusion.stopping import NEVER
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.conditioning import condition_on_angle
 from rayfix_tables.gaussians.normal_points import unit_points
@@ -246,7 +247,7 @@ def extend_beam(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Products by the kernel, the best first."""
     columns = information_form.pack(*hypotheses), information_form.pack(*factor)
-    parent, choice, score = beam_kernels.extend_beam(*columns, width, hopeless, LOG_VOLUME, LOG_RANGE)
+    parent, choice, score = beam_kernels.extend_beam(*columns, width, hopeless, LOG_VOLUME, LOG_RANGE, NEVER.cell)
     order = np.argsort(-score)
     return parent[order], choice[order], score[order]
 

@@ -72,6 +72,8 @@ class Fix:
         Regions around the position that hold the UE with any probability; None where there is no position.
     confidence : float
         Probability that the report wants regions of.
+    simplified : tuple of str
+        What was worked out more coarsely than the report says, since the work per report is bounded; mostly empty.
     """
 
     status: Status
@@ -81,6 +83,7 @@ class Fix:
     table_id: str
     regions: "CredibleRegions | None" = None
     confidence: float = CONFIDENCE
+    simplified: tuple[str, ...] = ()
     target_id: str | None = None
     timestamp: str | None = None
 

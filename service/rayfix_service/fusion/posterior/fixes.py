@@ -13,6 +13,7 @@ from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.outliers import culprits
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.table import Table
 
 _LEAST_CANDIDATE = 1e-3
@@ -30,15 +31,18 @@ class Product(NamedTuple):
         Why measurements do not, by their places in the report.
     prior : Prior
     hypotheses : Hypotheses or None
+    simplified : tuple of str
+        What was worked out more coarsely than the report says, since the work per report is bounded.
     """
 
     observations: list[Observation]
     unused: dict[int, str]
     prior: Prior
     hypotheses: Hypotheses | None
+    simplified: tuple[str, ...] = ()
 
 
-def make_fix(report: Report, product: Product, table: Table, settings: FusionSettings) -> Fix:
+def make_fix(report: Report, product: Product, table: Table, settings: FusionSettings, stop: Stop = NEVER) -> Fix:
     """Sum the hypotheses of a report up.
 
     Parameters
@@ -49,6 +53,13 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
     table : Table
         Of the same site; its free space is what the hypotheses are cut to.
     settings : FusionSettings
+    stop : Stop
+        Ends it early.
+
+    Raises
+    ------
+    FixStoppedError
+        When it was.
     """
     candidates: tuple[Candidate, ...] = ()
     regions = None
@@ -61,7 +72,7 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
             log_evidence, status = hypotheses.log_lost, "inconsistent"
             outlier = dict.fromkeys(found.places, 1.0)
         else:
-            summary = sum_up(hypotheses, found, table.scene.free_space, settings.hypothesis_floor)
+            summary = sum_up(hypotheses, found, table.scene.free_space, settings.hypothesis_floor, stop)
             log_evidence, share = summary.log_evidence, 1.0 - summary.lost
             candidates = tuple(
                 Candidate(probability=p * share, position=summary.position[n], covariance=summary.moment[n])
@@ -90,6 +101,7 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
         log_evidence=log_evidence,
         regions=regions,
         confidence=report.confidence,
+        simplified=product.simplified,
         table_id=table.table_id,
         target_id=report.target_id,
         timestamp=report.timestamp,

@@ -19,7 +19,7 @@ _NEAR = 3.0
 
 
 @numba.njit(cache=True, nogil=True)
-def find_hills(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any) -> Any:
+def find_hills(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any, stop: Any) -> Any:
     """Climb from Gaussians to the modes of their mixture, gather them by the hill they belong to, sum each hill up.
 
     Parameters
@@ -30,6 +30,8 @@ def find_hills(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
     cov : ndarray of shape (h, 3, 3), m2
     origin, voxel_size, free
         As in :class:`~rayfix_tables.freespace.FreeSpace`.
+    stop : ndarray of uint8, shape (1,)
+        As in :class:`~rayfix_service.fusion.stopping.Stop`, looked at before each climb.
 
     Returns
     -------
@@ -49,7 +51,7 @@ def find_hills(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
         cholesky(cov[h], lower)
         invert(lower, precision[h])
         log_density[h] = log_weight[h] - np.log(lower[0, 0] * lower[1, 1] * lower[2, 2])
-    top, member = gather(log_density, mean, precision, _SAME_HILL)
+    top, member = gather(log_density, mean, precision, _SAME_HILL, stop)
     weight = np.exp(log_weight)
     probability, position = np.zeros(len(top)), np.zeros((len(top), 3))
     for h in range(count):
@@ -89,7 +91,7 @@ def _second_moments(weight: Any, mean: Any, cov: Any, member: Any, total: Any, p
 
 
 @numba.njit(cache=True, nogil=True)
-def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any) -> Any:
+def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any, stop: Any) -> Any:
     """Climb from each hypothesis, the densest first, and gather the hypotheses by the hill they come to.
 
     Parameters
@@ -101,6 +103,8 @@ def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any) -> Any:
     same_hill : float
         Two modes are one hill, though with two humps, when their squared distance is below this in what either is
         uncertain by.
+    stop : ndarray of uint8, shape (1,)
+        As in :class:`~rayfix_service.fusion.stopping.Stop`; once it is set, those that are left go to the first hill.
 
     Returns
     -------
@@ -110,11 +114,13 @@ def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any) -> Any:
         Hill of each hypothesis.
     """
     count = len(log_density)
-    member = np.empty(count, np.int64)
+    member = np.zeros(count, np.int64)
     top = np.empty((count, 3))
     curvature = np.empty((count, 3, 3))
     found = 0
     for h in np.argsort(-log_density):
+        if stop[0] != 0 and found > 0:
+            break
         mode, here, hill = climb(log_density, mean, precision, mean[h], top[:found], curvature[:found])
         for n in range(found):
             if hill >= 0:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import Prior
+from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.normal_points import normal_points
 
@@ -86,13 +87,15 @@ class Posterior:
             log_density[free] = np.logaddexp(log_density[free], np.log(self.prior_share) + log_prior)
         return log_density
 
-    def sample(self, count: int, rng: np.random.Generator) -> Array:
+    def sample(self, count: int, rng: np.random.Generator, *, stop: Stop = NEVER) -> Array:
         """Draw positions.
 
         Parameters
         ----------
         count : int
         rng : numpy.random.Generator
+        stop : Stop
+            Ends it early, from another thread; then this raises a ``FixStoppedError``.
 
         Returns
         -------
@@ -100,10 +103,10 @@ class Posterior:
             In the free space.
         """
         from_prior = int(rng.binomial(count, self.prior_share))
-        parts = [self._sample_prior(from_prior, rng), *self._sample_gaussians(count - from_prior, rng)]
+        parts = [self._sample_prior(from_prior, rng), *self._sample_gaussians(count - from_prior, rng, stop)]
         return np.asarray(rng.permutation(np.concatenate(parts)))
 
-    def _sample_gaussians(self, count: int, rng: np.random.Generator) -> Iterator[Array]:
+    def _sample_gaussians(self, count: int, rng: np.random.Generator, stop: Stop) -> Iterator[Array]:
         """Draw from the Gaussians and keep what is free, which is exact whatever their free shares are."""
         if count == 0:
             return
@@ -113,6 +116,7 @@ class Posterior:
         weight /= weight.sum()
         roots = np.linalg.cholesky(self.cov)
         while count > 0:
+            stop.check()
             tries = min(int(1.2 * count / free_share) + 16, _CHUNK)
             pick = rng.choice(len(weight), tries, p=weight)
             drawn = self.mean[pick] + np.einsum("nij,nj->ni", roots[pick], rng.standard_normal((tries, 3)))
@@ -149,8 +153,14 @@ class Posterior:
         return places
 
 
-def make_posterior(hypotheses: Hypotheses | None, prior: Prior, free_space: FreeSpace) -> Posterior:
-    """Posterior of hypotheses, or the prior where there are none."""
+def make_posterior(hypotheses: Hypotheses | None, prior: Prior, free_space: FreeSpace, stop: Stop = NEVER) -> Posterior:
+    """Posterior of hypotheses, or the prior where there are none.
+
+    Raises
+    ------
+    FixStoppedError
+        When ``stop`` was set before it was done.
+    """
     if hypotheses is None or not len(hypotheses):
         return Posterior(
             log_weight=np.empty(0),
@@ -161,7 +171,7 @@ def make_posterior(hypotheses: Hypotheses | None, prior: Prior, free_space: Free
             free_space=free_space,
             log_evidence=0.0 if hypotheses is None else hypotheses.log_lost,
         )
-    share = free_shares(hypotheses.mean, hypotheses.cov, free_space)
+    share = free_shares(hypotheses.mean, hypotheses.cov, free_space, stop)
     keep = share > 0.0
     log_weight = hypotheses.log_weight[keep]
     log_evidence = float(np.logaddexp.reduce([*(log_weight + np.log(share[keep])), hypotheses.log_lost]))
@@ -176,18 +186,24 @@ def make_posterior(hypotheses: Hypotheses | None, prior: Prior, free_space: Free
     )
 
 
-def free_shares(mean: Array, cov: Array, free_space: FreeSpace) -> Array:
+def free_shares(mean: Array, cov: Array, free_space: FreeSpace, stop: Stop = NEVER) -> Array:
     """Share of each Gaussian that lies in the free space, shape (h,).
 
     Parameters
     ----------
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
+    stop : Stop
+        Ends it early.
+
+    Raises
+    ------
+    FixStoppedError
+        When it was.
     """
     points = normal_points(_NUM_POINTS)
-    return np.array(
-        [
-            free_space.contains(centre + points @ root.T).mean()
-            for centre, root in zip(mean, np.linalg.cholesky(cov), strict=True)
-        ]
-    )
+    shares = np.empty(len(mean))
+    for h, (centre, root) in enumerate(zip(mean, np.linalg.cholesky(cov), strict=True)):
+        stop.check()
+        shares[h] = free_space.contains(centre + points @ root.T).mean()
+    return shares

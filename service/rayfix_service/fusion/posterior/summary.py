@@ -13,6 +13,7 @@ from rayfix_service.fusion.posterior.modes import find_hills
 from rayfix_service.fusion.posterior.points import DrawnPoints, draw_points
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.outliers import Culprits, outlier_probabilities
+from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.normal_points import normal_points, unit_points
 
@@ -51,7 +52,9 @@ class Summary(NamedTuple):
     points: DrawnPoints
 
 
-def sum_up(hypotheses: Hypotheses, culprits: Culprits, free_space: FreeSpace, floor: float) -> Summary:
+def sum_up(
+    hypotheses: Hypotheses, culprits: Culprits, free_space: FreeSpace, floor: float, stop: Stop = NEVER
+) -> Summary:
     """Sum hypotheses up, cut to the free space.
 
     Parameters
@@ -60,6 +63,13 @@ def sum_up(hypotheses: Hypotheses, culprits: Culprits, free_space: FreeSpace, fl
         At least one.
     floor : float
         Hypotheses whose share of the posterior is below this are left out of the hills.
+    stop : Stop
+        Ends it early.
+
+    Raises
+    ------
+    FixStoppedError
+        When it was.
     """
     log_evidence, lost, hills, outlier, half_bad, drawn = _sum_up(
         hypotheses.log_weight,
@@ -75,7 +85,9 @@ def sum_up(hypotheses: Hypotheses, culprits: Culprits, free_space: FreeSpace, fl
         free_space.origin,
         free_space.voxel_size,
         free_space.free,
+        stop.cell,
     )
+    stop.check()
     probability, position, moment = hills
     mean, root, owner = drawn
     points = DrawnPoints(mean=mean, root=root, owner=owner)
@@ -97,6 +109,7 @@ def _sum_up(
     origin: Any,
     voxel_size: Any,
     free: Any,
+    stop: Any,
 ) -> Any:
     """Give the entries of a :class:`Summary`; ``unit`` and ``normal`` are points that stand for a standard normal."""
     log_cut, cut_mean, cut_cov = cut_to_free_space(log_weight, mean, cov, unit, origin, voxel_size, free)
@@ -106,7 +119,7 @@ def _sum_up(
     log_cut -= log_found
     keep = np.flatnonzero(log_cut > log_floor)
     kept = log_cut[keep], cut_mean[keep], cut_cov[keep]
-    probability, position, moment, _ = find_hills(*kept, origin, voxel_size, free)
+    probability, position, moment, _ = find_hills(*kept, origin, voxel_size, free, stop)
     weight = (1.0 - lost) * np.exp(log_cut)
     totals, half_bad = outlier_probabilities(outlier, weight, lost, rows, count)
     drawn = draw_points(log_weight, mean, cov, normal, origin, voxel_size, free)

@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 from rayfix_service.fusion.product.beam_kernels import multiply_factors
 from rayfix_service.fusion.product.factors import Factor
 from rayfix_service.fusion.product.prior import Prior
+from rayfix_service.fusion.stopping import NEVER, Stop
+
+_MOST_PRODUCTS = 1e15
+"""More than anybody waits for: as good as infinitely many, and their number still fits an integer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +31,8 @@ class Hypotheses:
         What the hypothesis takes for an outlier in each factor.
     log_lost : float
         Log evidence of the hypothesis that all factors are outliers, which is none of the above.
+    omitted : int
+        Hypotheses that were left out because there were too many products to form.
     """
 
     log_weight: NDArray[np.float64]
@@ -34,6 +40,7 @@ class Hypotheses:
     cov: NDArray[np.float64]
     outlier: NDArray[np.int8]
     log_lost: float
+    omitted: int = 0
 
     def __len__(self) -> int:
         """Return the number of hypotheses."""
@@ -47,6 +54,8 @@ def multiply(
     prior: Prior,
     width: int,
     max_divergence: float,
+    most_products: float = math.inf,
+    stop: Stop = NEVER,
 ) -> Hypotheses:
     """Find the most probable products of one alternative of each factor.
 
@@ -62,11 +71,20 @@ def multiply(
         Products that are kept after each factor, before those that mean the same are merged.
     max_divergence : float
         What such a merge may cost, nats.
+    most_products : float
+        Products that may be formed; those of a state with clocks count for more.
+    stop : Stop
+        Ends it early.
+
+    Raises
+    ------
+    FixStoppedError
+        When it was.
     """
     columns = np.concatenate([factor.columns for factor in factors], axis=1)
     outlier = np.concatenate([factor.outlier for factor in factors])
     offsets = np.array([0, *itertools.accumulate([len(factor) for factor in factors])])
-    log_weight, mean, cov, outlier, log_lost = multiply_factors(
+    log_weight, mean, cov, outlier, log_lost, omitted = multiply_factors(
         columns,
         outlier,
         offsets,
@@ -76,5 +94,8 @@ def multiply(
         math.log(max_path_length),
         width,
         max_divergence,
+        float(min(most_products, _MOST_PRODUCTS)),
+        stop.cell,
     )
-    return Hypotheses(log_weight=log_weight, mean=mean, cov=cov, outlier=outlier, log_lost=log_lost)
+    stop.check()
+    return Hypotheses(log_weight=log_weight, mean=mean, cov=cov, outlier=outlier, log_lost=log_lost, omitted=omitted)

@@ -27,6 +27,8 @@ def multiply_factors(
     log_range: Any,
     width: Any,
     max_divergence: Any,
+    most_products: Any,
+    stop: Any,
 ) -> Any:
     """Extend a beam by one factor after the other, merging hypotheses that mean the same.
 
@@ -47,6 +49,10 @@ def multiply_factors(
         Products that are kept after each factor.
     max_divergence : float
         What a merge may cost, nats.
+    most_products : float
+        Products that may be formed, in those of no clock. Each factor may take its share of what is left.
+    stop : ndarray of uint8, shape (1,)
+        As in :class:`~rayfix_service.fusion.stopping.Stop`, looked at for each hypothesis.
 
     Returns
     -------
@@ -57,15 +63,33 @@ def multiply_factors(
     outlier : ndarray of int8, shape (h, n)
     log_lost : float
         Log evidence of the hypothesis that all factors are outliers, which is none of the above.
+    omitted : int
+        Hypotheses that ``most_products`` left out.
     """
     beam = _prior_column(dimension_of(alternatives), precision, eta, log_volume, log_range)
     chosen = np.zeros((1, len(offsets) - 1), np.int8)
     pattern = np.zeros(1, np.int64)
     score = np.zeros(1)
-    for factor in _order(alternatives[-1], offsets):
-        begin, stop = offsets[factor], offsets[factor + 1]
-        own = np.ascontiguousarray(alternatives[:, begin:stop])
-        parent, choice, score = extend_beam(beam, own, width, HOPELESS, log_volume, log_range)
+    product_cost, merge_cost = product_costs(dimension_of(alternatives))
+    left_over, omitted = most_products, 0
+    order = _order(alternatives[-1], offsets)
+    for place in range(len(order)):
+        if stop[0] != 0:
+            break
+        factor = order[place]
+        begin, end = offsets[factor], offsets[factor + 1]
+        own = np.ascontiguousarray(alternatives[:, begin:end])
+        # Half of a factor's share is for the products, half for merging them.
+        share = 0.5 * left_over / (len(order) - place)
+        most = max(1, int(share / (product_cost * (end - begin))))
+        if most < beam.shape[1]:
+            omitted += beam.shape[1] - most
+            beam = np.ascontiguousarray(beam[:, :most])
+        kept = max(1, min(width, int(share / merge_cost)))
+        parent, choice, score = extend_beam(beam, own, kept, HOPELESS, log_volume, log_range, stop)
+        if kept < width and len(score) == kept:
+            omitted += 1  # at least
+        left_over -= product_cost * beam.shape[1] * (end - begin) + merge_cost * len(score)
         product = np.empty((len(beam), len(score)))
         next_pattern = np.empty(len(score), np.int64)
         for n in range(len(score)):
@@ -88,7 +112,14 @@ def multiply_factors(
     for factor in range(len(offsets) - 1):
         log_lost += alternatives[-1, offsets[factor + 1] - 1]
     log_weight, mean, cov, chosen = _placed(beam, score, chosen)
-    return log_weight, mean, cov, chosen, log_lost
+    return log_weight, mean, cov, chosen, log_lost, omitted
+
+
+@numba.njit(cache=True, nogil=True)
+def product_costs(dimension: Any) -> Any:
+    """Return what forming a product of a dimension and merging it take, in products of dimension 3."""
+    # Fitted to times: 17 ns and 0.2 us a product of dimension 3, 1.25 us and 27 us of dimension 24.
+    return 0.86 + 0.0052 * dimension**3, 12.0 + 3.0 * dimension * (dimension - 3)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -115,7 +146,7 @@ def _prior_column(dimension: Any, precision: Any, eta: Any, log_volume: Any, log
 
 
 @numba.njit(cache=True, nogil=True)
-def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: Any, log_range: Any) -> Any:
+def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: Any, log_range: Any, stop: Any) -> Any:
     """Multiply every hypothesis by every alternative of a factor and keep the best products.
 
     Parameters
@@ -130,6 +161,8 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
         Products this many nats below the best are given up.
     log_volume, log_range : float
         As in :func:`~rayfix_service.fusion.product.information_form.log_integrals`.
+    stop : ndarray of uint8, shape (1,)
+        As in :class:`~rayfix_service.fusion.stopping.Stop`.
 
     Returns
     -------
@@ -148,6 +181,8 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
     kept = 0
     top = -np.inf
     for h in range(beam.shape[1]):
+        if stop[0] != 0:
+            break
         add(beam, h, factor, products)
         log_integrals(products, log_volume, log_range, scratch, values)
         for k in range(count):

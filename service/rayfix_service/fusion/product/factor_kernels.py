@@ -52,6 +52,8 @@ def make_alternatives(
     log_outlier: Any,
     log_floor: Any,
     max_divergence: Any,
+    most: Any,
+    stop: Any,
 ) -> Any:
     """Make the alternatives of one observation, the last of them that all of it is an outlier.
 
@@ -74,12 +76,18 @@ def make_alternatives(
         Log evidence, relative to the best alternative's, of what is left out.
     max_divergence : float
         What merging two may cost, nats.
+    most : int
+        Alternatives that are kept besides the last, those with the highest evidence.
+    stop : ndarray of uint8, shape (1,)
+        As in :class:`~rayfix_service.fusion.stopping.Stop`, looked at before each part.
 
     Returns
     -------
     columns : ndarray of shape (rows, n)
         As :mod:`rayfix_service.fusion.product.information_form` has them.
     outlier : ndarray of int8, shape (n,)
+    omitted : int
+        How many more there would be than ``most``.
     """
     offsets = np.zeros(len(parts) + 1, np.int64)
     for p in range(len(parts)):
@@ -91,10 +99,16 @@ def make_alternatives(
         tops[p] = weigh(log_evidence, mean, cov, parts[p], precision, eta, logs[own], scores[own])
     top = max(log_outlier + log_volume, tops.max())
     dimension = 3 + num_clocks
-    columns = np.empty((triangle(dimension) + dimension + 1, offsets[-1] + 1))
-    outlier = np.empty(offsets[-1] + 1, np.int8)
-    done = 0
+    room = min(offsets[-1], most + np.diff(offsets).max()) + 1
+    columns, outlier, value = (
+        np.empty((triangle(dimension) + dimension + 1, room)),
+        np.empty(room, np.int8),
+        np.empty(room),
+    )
+    done, omitted = 0, 0
     for p in range(len(parts)):
+        if stop[0] != 0:
+            break
         part = parts[p]
         keep = np.flatnonzero(scores[offsets[p] : offsets[p + 1]] > top + log_floor)
         own_log, own_mean, own_cov = logs[offsets[p] + keep], mean[part.begin + keep], cov[part.begin + keep]
@@ -107,11 +121,19 @@ def make_alternatives(
         out = slice(done, done + len(left))
         to_columns(own_log[left], own_mean[left], own_cov[left], own_readings, dimension, columns[:, out])
         outlier[out] = part.outlier
+        value[out] = own_log[left] + part.log_clocks
         done = out.stop
+        if done > most:
+            best = np.sort(np.argsort(-value[:done], kind="mergesort")[:most])
+            for row in range(len(columns)):
+                columns[row, :most] = columns[row, best]
+            outlier[:most], value[:most] = outlier[best], value[best]
+            omitted += done - most
+            done = most
     columns[:-1, done] = 0.0
     columns[-1, done] = log_outlier
     outlier[done] = ALL_OUTLIER
-    return columns[:, : done + 1].copy(), outlier[: done + 1].copy()
+    return columns[:, : done + 1].copy(), outlier[: done + 1].copy(), omitted
 
 
 @numba.njit(cache=True, nogil=True)

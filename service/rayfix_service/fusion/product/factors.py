@@ -13,10 +13,12 @@ from rayfix_service.fusion.measurements.directions import Direction
 from rayfix_service.fusion.measurements.likelihood import Term, product, total_variance
 from rayfix_service.fusion.measurements.line_of_sight import sight
 from rayfix_service.fusion.measurements.observations import Observation
+from rayfix_service.fusion.product.beam_kernels import product_costs
 from rayfix_service.fusion.product.factor_kernels import ALL_GOOD, PART, READING, TIME_OUTLIER, make_alternatives
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.product.station_mixture import HeardStation, join
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.fusion.stopping import NEVER, Stop
 
 _ANY_LENGTH = Term(0.0, 0.0, math.inf)
 """Likelihood of a path length that was not measured."""
@@ -32,10 +34,16 @@ class Factor:
         One alternative each, as :mod:`rayfix_service.fusion.product.information_form` has them.
     outlier : ndarray of int8, shape (k,)
         ALL_GOOD, TIME_OUTLIER or ALL_OUTLIER; the last alternative is always ALL_OUTLIER.
+    considered : int
+        Alternatives that were looked at for it.
+    omitted : bool
+        Whether it has fewer alternatives than it would have without a bound on them.
     """
 
     columns: NDArray[np.float64]
     outlier: NDArray[np.int8]
+    considered: int = 0
+    omitted: bool = False
 
     def __len__(self) -> int:
         """Return the number of alternatives."""
@@ -50,6 +58,8 @@ def make_factor(
     max_path_length: float,
     prior: Prior,
     settings: FusionSettings,
+    most_considered: int | None = None,
+    stop: Stop = NEVER,
 ) -> Factor | None:
     """Alternatives of one observation, or None where no ray of the table comes.
 
@@ -59,6 +69,15 @@ def make_factor(
         A time that is an outlier may be anything up to this, and noise.
     prior : Prior
         Not part of the factor, but of the judgement which alternatives are worth keeping.
+    most_considered : int, optional
+        Alternatives to look at, though at least those of one combination of errors; as many as there are by default.
+    stop : Stop
+        Ends it early.
+
+    Raises
+    ------
+    FixStoppedError
+        When it was.
     """
     said = observation.los_probability
     seen = None if said is None else sight(said, settings.sight_error)
@@ -82,9 +101,10 @@ def make_factor(
         for kind in kinds
         for n, spread in enumerate(observation.angle_spreads)
     ]
-    columns, outlier = make_alternatives(
+    taken = parts if most_considered is None else _within(parts, most_considered)
+    columns, outlier, omitted = make_alternatives(
         *join(heard),
-        np.array(parts, PART),
+        np.array(taken, PART),
         np.array(readings, READING),
         num_clocks,
         prior.precision,
@@ -93,8 +113,43 @@ def make_factor(
         log_bad + log_any_time - _log_angle_range(observation),
         math.log(settings.component_floor),
         settings.max_divergence,
+        int(settings.most_alternatives / math.sqrt(product_costs(3 + num_clocks)[0])),
+        stop.cell,
     )
-    return Factor(columns=columns, outlier=outlier)
+    stop.check()
+    return Factor(
+        columns=columns,
+        outlier=outlier,
+        considered=max(bounds[-1], _size(taken)),
+        omitted=omitted > 0 or len(taken) < len(parts),
+    )
+
+
+_Part = tuple[int, int, int, float, float, float, float, int, int]
+"""What becomes a record of :data:`PART`."""
+
+
+def _size(parts: list[_Part]) -> int:
+    """Return how many alternatives parts are of."""
+    return sum([stop - begin for _, begin, stop, *_ in parts])
+
+
+def _within(parts: list[_Part], most: int) -> list[_Part]:
+    """Leave out the less probable combinations of errors until there are at most so many alternatives, or one is left.
+
+    Alternatives whose times are outliers stay: they are what else a time may be that the combinations left do not fit.
+    """
+    size = _size(parts)
+    if size <= most:
+        return parts
+    good = sorted((n for n, part in enumerate(parts) if part[0] == ALL_GOOD), key=lambda n: parts[n][3])
+    out = set[int]()
+    for n in good[:-1]:
+        if size <= most:
+            break
+        out.add(n)
+        size -= parts[n][2] - parts[n][1]
+    return [part for n, part in enumerate(parts) if n not in out]
 
 
 class _Kind(NamedTuple):

@@ -81,6 +81,13 @@ class HeardStation:
         lookup = look_up(self.part.levels, measured)
         return _condition(lookup).weighed(np.where(is_direct(lookup), *sight))
 
+    def kept(self, by_sight: bool) -> int | None:
+        """Return how many Gaussians the paths of all directions are, None while they are not merged yet."""
+        found = self.__dict__.get("everywhere_by_sight" if by_sight else "everywhere")
+        if found is None:
+            return None
+        return sum(map(len, found)) if by_sight else len(found)
+
     @cached_property
     def everywhere(self) -> Heard:
         """Gaussians of the paths of all directions, those merged that no path length tells apart."""

@@ -70,6 +70,21 @@ class Access:
             self._limit.charge(client)
 
 
+def charge_report(connection: HTTPConnection) -> None:
+    """Count a request that is no POST as a report, for what takes as long as one.
+
+    Raises
+    ------
+    ProblemError
+        When the client has sent more than it may.
+    """
+    limit: RateLimit | None = connection.app.state.rate_limit
+    if limit is not None:
+        client = client_of(connection)
+        _require_tokens(limit.seconds_to_wait(client))
+        limit.charge(client)
+
+
 def charge_reports(connection: HTTPConnection, reports: int) -> None:
     """Charge the reports of a request that is read now, of which one was charged when its head came.
 

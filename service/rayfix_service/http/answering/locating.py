@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from time import perf_counter
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar, cast
 
 from fastapi import Depends
 from pydantic_core import from_json, to_json
@@ -18,11 +18,13 @@ from rayfix_service.adapters.omlox_hub import OmloxHub
 from rayfix_service.fusion.locator import Fused
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.fusion.stopping import NEVER
 from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.response_options import Wanted
 from rayfix_service.http.answering.served_tables import ServedTable
-from rayfix_service.http.answering.slow_work import SlowFixes, is_slow
+from rayfix_service.http.answering.slow_work import SlowFixes, Stoppable
 from rayfix_service.http.problems import ProblemError, internal_problem, problem_document, report_problem
+from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.telemetry.metrics import Metrics
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report, report_to_document
@@ -87,12 +89,29 @@ class Located(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Answerer:
-    """What answers reports: figures to add to, the feed and hub to tell, threads for slow ones, the turn to read."""
+    """What answers reports.
+
+    Attributes
+    ----------
+    metrics : Metrics
+        To add to.
+    feed : FixFeed
+        To tell of fixes.
+    slow_fixes : SlowFixes
+        Threads for what takes longer, by its estimate, than ``quick_seconds``.
+    hub : OmloxHub or None
+        To tell of positions.
+    quick_seconds : float
+        What a fix may take on the event loop.
+    reading : asyncio.Lock
+        The turn to read a long body.
+    """
 
     metrics: Metrics
     feed: FixFeed
     slow_fixes: SlowFixes
     hub: OmloxHub | None
+    quick_seconds: float = ServiceSettings.quick_fix_seconds
     reading: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def read(self, parse: Callable[[bytes], T], body: bytes) -> T:
@@ -121,8 +140,9 @@ class Answerer:
     async def locate(self, table: ServedTable, incoming: Incoming, wanted: Wanted) -> Located:
         """Locate a report with a table, and follow its target if that is wanted.
 
-        A fix with an angle takes less than a millisecond or a few, right on the event loop. In the thread pool that
-        FastAPI has for "def" such fixes would wait for each other's GIL; more worker processes use more cores.
+        A fix that takes less than a millisecond or a few by its estimate, as most do, is made right on the event loop.
+        In the thread pool that FastAPI has for "def" such fixes would wait for each other's GIL; more worker processes
+        use more cores. Others go to the threads for slow fixes.
 
         Raises
         ------
@@ -132,10 +152,13 @@ class Answerer:
             When the fix is slow and the service too busy.
         """
         report = incoming.report
-        locate: Callable[[Report], Fix | Fused] = table.locator.fuse if wanted.follows(report) else table.locator.locate
+        locator = table.locator
+        locate = cast("Stoppable[Report, Fix | Fused]", locator.fuse if wanted.follows(report) else locator.locate)
+        quick = table.locator.seconds(report) <= self.quick_seconds
         start = perf_counter()
         try:
-            found = await self.slow_fixes.locate(locate, report) if is_slow(report) else locate(report)
+            found: Fix | Fused
+            found = locate(report, stop=NEVER) if quick else await self.slow_fixes.locate(locate, report)
             seconds = perf_counter() - start
             fix = found.fix if isinstance(found, Fused) else found
             self.metrics.fix_done(fix, seconds)

@@ -3,25 +3,22 @@
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from functools import partial
+from typing import Protocol, TypeVar
 
-from rayfix_service.fusion.measurements.report import Angle, Report
+from rayfix_service.fusion.stopping import FixStoppedError, Stop
 from rayfix_service.http.problems import FIX_TIMEOUT, OVERLOADED, ProblemError
 
-Asked = TypeVar("Asked")
+Asked_contra = TypeVar("Asked_contra", contravariant=True)
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
-_MEASUREMENTS_ON_LOOP = 16
 
+class Stoppable(Protocol[Asked_contra, T_co]):
+    """Work that ends early, by a :class:`FixStoppedError`, once ``stop`` is set."""
 
-def is_slow(report: Report) -> bool:
-    """Tell whether a fix may take longer than the event loop should wait.
-
-    An angle picks a few cells of the table; without one, all of them matter. Very many measurements take seconds.
-    """
-    if len(report.measurements) > _MEASUREMENTS_ON_LOOP:
-        return True
-    return not any(isinstance(measurement, Angle) for measurement in report.measurements)
+    def __call__(self, asked: Asked_contra, /, *, stop: Stop) -> T_co:
+        """Do it."""
 
 
 class SlowFixes:
@@ -34,7 +31,7 @@ class SlowFixes:
     waiting : int
         Fixes that may wait for a thread; more are refused.
     seconds : float
-        After which a fix is given up, waiting included.
+        After which a fix is given up, waiting included. Its thread is free again some milliseconds later.
     """
 
     def __init__(self, *, threads: int, waiting: int, seconds: float) -> None:
@@ -43,7 +40,27 @@ class SlowFixes:
         self._seconds = seconds
         self._under_way = 0
 
-    async def locate(self, locate: Callable[[Asked], T], report: Asked) -> T:
+    @property
+    def under_way(self) -> int:
+        """Fixes that wait for a thread or have one, those included that are given up and have not stopped yet."""
+        return self._under_way
+
+    async def run(self, work: Callable[[], T]) -> T:
+        """Do in a thread what cannot be stopped, but takes well below a second.
+
+        Raises
+        ------
+        ProblemError
+            When too many wait, or the time is over.
+        """
+
+        def do(_: None, /, *, stop: Stop) -> T:
+            stop.check()
+            return work()
+
+        return await self.locate(do, None)
+
+    async def locate(self, locate: Stoppable[Asked_contra, T], report: Asked_contra) -> T:
         """Locate a report in a thread, or do what takes as long with something else that was asked.
 
         Raises
@@ -56,20 +73,26 @@ class SlowFixes:
         if self._under_way >= self._most:
             raise ProblemError(
                 OVERLOADED,
-                "too many reports without angles are under way; try again later, or send angles too",
+                "too many reports that take long are under way; try again later, or send fewer measurements and "
+                "narrower angles",
                 headers={"Retry-After": "1"},
             )
         self._under_way += 1
-        work = asyncio.get_running_loop().run_in_executor(self._executor, locate, report)
+        stop = Stop()
+        loop = asyncio.get_running_loop()
+        work = loop.run_in_executor(self._executor, partial(locate, report, stop=stop))
         work.add_done_callback(self._done)
         try:
-            # A thread cannot be ended: what is given up keeps its place among those under way until it is done.
+            # A thread cannot be ended: what is given up keeps its place among those under way until it has stopped.
             return await asyncio.wait_for(asyncio.shield(work), self._seconds)
-        except TimeoutError:
-            work.cancel()  # if it has not begun
+        except (TimeoutError, FixStoppedError):
             raise ProblemError(
                 FIX_TIMEOUT, f"the fix took longer than {self._seconds:g} s; send fewer measurements"
             ) from None
+        finally:
+            # Also when nobody waits any more.
+            stop.set()
+            work.cancel()  # if it has not begun
 
     def _done(self, work: "asyncio.Future[T]") -> None:
         self._under_way -= 1

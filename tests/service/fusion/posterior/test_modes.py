@@ -9,6 +9,7 @@ from scipy.stats import norm
 
 from rayfix_service.fusion.posterior import modes
 from rayfix_service.fusion.posterior.cut_by_walls import cut_to_free_space
+from rayfix_service.fusion.stopping import NEVER
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.normal_points import unit_points
 from tests.support import kernel_twins
@@ -44,7 +45,7 @@ class Hills(NamedTuple):
 
 def hills_of(weight: Array, mean: Array, cov: Array, free_space: FreeSpace) -> Hills:
     space = free_space.origin, free_space.voxel_size, free_space.free
-    return Hills(*modes.find_hills(np.log(weight), mean, cov, *space))
+    return Hills(*modes.find_hills(np.log(weight), mean, cov, *space, NEVER.cell))
 
 
 def cut(mean: Array, cov: Array, free_space: FreeSpace) -> tuple[Array, Array, Array]:
@@ -161,7 +162,7 @@ def test_gathering_equals_climbing_all_the_way_from_each(seed: int) -> None:
     weight, mean, cov = random_mixture(seed, 40)
     precision = np.asarray(np.linalg.inv(cov), np.float64)
     log_peak = np.log(weight) + 0.5 * np.linalg.slogdet(precision)[1]
-    _, member = modes.gather(log_peak, mean, precision, 9.0)
+    _, member = modes.gather(log_peak, mean, precision, 9.0, NEVER.cell)
     tops: list[tuple[Array, Array]] = []
     expected = np.full(40, -1)
     for h in np.argsort(-log_peak):
