@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: viewer browser screenshots demo test lint types package images accuracy openapi clean
+.PHONY: viewer browser screenshots demo test test-portable lint types package images accuracy openapi clean
 
 # The environment is made anew when what it holds has changed.
 $(VENV)/.done: pyproject.toml constraints.txt
@@ -34,6 +34,10 @@ demo: $(VENV)/.done
 
 test: $(VENV)/.done
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
+
+# The numerical tests with the kernels of older processors, on one thread and on two: nothing depends on this one's rounding.
+test-portable: $(VENV)/.done
+	$(BIN)/python tests/portable.py
 
 # In a real browser; what it showed is kept in browser-artefacts/.
 browser: $(VENV)/.done viewer

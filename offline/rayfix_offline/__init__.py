@@ -1,1 +1,7 @@
 """The offline half: a site and its mesh become rays, mixtures and a table."""
+
+from pathlib import Path
+
+from rayfix_tables.gaussians.kernel_cache import ensure_kernel_cache
+
+ensure_kernel_cache(Path(__file__).parent)

@@ -13,8 +13,11 @@ from rayfix_tables.site import SiteInfo, Station, StationBias
 LEAST_WINDOW_RATIO = 1.5
 """A window is at least this many times the one before it: its cells are sums, which must be flat, of those."""
 
+LARGEST_COORDINATE = 5e7
+"""m; maps have coordinates of up to 2e7 m, and single precision tells no walls apart far beyond."""
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(ge=-LARGEST_COORDINATE, le=LARGEST_COORDINATE)]
 Triple = tuple[Finite, Finite, Finite]
 
 
@@ -66,8 +69,8 @@ class TableSection(_Section):
 class BiasSection(_Section):
     """``[stations.bias]``: what a station measures wrongly each time, measured minus true."""
 
-    range_m: Finite = 0.0
-    range_stdev_m: NotNegative = 0.0
+    range_m: Annotated[float, Field(ge=-10_000, le=10_000)] = 0.0
+    range_stdev_m: Annotated[float, Field(ge=0, le=10_000)] = 0.0
     azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     zenith_deg: Annotated[float, Field(ge=-90, le=90)] = 0.0
     angle_stdev_deg: Annotated[float, Field(ge=0, le=90)] = 0.0
@@ -77,7 +80,7 @@ class StationSection(_Section):
     """``[[stations]]``: one base station, anchor or locator."""
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}$")]
-    position_m: Triple
+    position_m: tuple[Coordinate, Coordinate, Coordinate]
     orientation_deg: Triple = (0.0, 0.0, 0.0)
     field_of_view_deg: Annotated[float, Field(gt=0, le=360)] = 360.0
     bias: BiasSection = BiasSection()

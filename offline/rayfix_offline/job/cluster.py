@@ -1,8 +1,8 @@
 """Fit blocks of cells on a Dask cluster.
 
 Tasks carry the numbers of their cells only. A worker gets the scene and the site once, by content hash, and traces a
-station's rays when the first of its blocks arrives; a block fitted anywhere is the same to the last bit. When a worker
-is lost, Dask gives its blocks to the others.
+station's rays when the first of its blocks arrives; a block fitted on any worker with the same kind of processor and
+the same libraries is the same to the last bit. When a worker is lost, Dask gives its blocks to the others.
 """
 
 import threading

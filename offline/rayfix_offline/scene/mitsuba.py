@@ -18,9 +18,15 @@ from trimesh.visual.material import PBRMaterial
 
 from rayfix_offline.scene.materials import itu_name
 from rayfix_offline.scene.placed import Placed
+from rayfix_offline.scene.scene_folder import inside, outside_error
+from rayfix_offline.scene.xml_limits import refuse_hostile_xml
 from rayfix_tables.errors import SceneError
 
+MOST_TRIANGLES = 20_000_000
+"""Triangles of a scene, each instance of a mesh counted; they take some 10 GB of memory."""
+
 _LARGEST = 1e9
+_LONGEST_DEFAULT = 1000
 _UNREADABLE = "export the scene again, with a Mitsuba exporter"
 
 
@@ -44,6 +50,12 @@ def read_mitsuba(path: Path, load_mesh: Callable[[Path], Any]) -> list[Placed]:
     """
     root = _parse(path)
     defaults = {element.get("name", ""): element.get("value", "") for element in root.iter("default")}
+    for key, value in defaults.items():
+        if len(value) > _LONGEST_DEFAULT:
+            raise SceneError(
+                f"{path} has a default '{key[:50]}' of {len(value):,} characters, more than {_LONGEST_DEFAULT}; "
+                "write the value where it belongs"
+            )
     for element in root.iter():
         for key, value in element.attrib.items():
             if "$" in value:
@@ -52,6 +64,7 @@ def read_mitsuba(path: Path, load_mesh: Callable[[Path], Any]) -> list[Placed]:
         raise SceneError(f"{path} includes another file, which is not supported; export the scene as one file")
     materials = {element.get("id", ""): _material_name(element) for element in root.iter("bsdf")}
     placed: list[Placed] = []
+    num_triangles = 0
     for number, shape in enumerate(root.iter("shape"), 1):
         name = (shape.get("id") or shape.get("name") or f"shape {number}").removeprefix("mesh-")
         where = f"{path}, shape '{name}'"
@@ -64,6 +77,11 @@ def read_mitsuba(path: Path, load_mesh: Callable[[Path], Any]) -> list[Placed]:
             if material is not None:
                 mesh.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(name=material))
             placed.append((name, mesh, transform))
+            num_triangles += len(mesh.faces)
+            if num_triangles > MOST_TRIANGLES:
+                raise SceneError(
+                    f"{where}: the scene has more than {MOST_TRIANGLES:,} triangles up to here; leave out what is small"
+                )
     return placed
 
 
@@ -74,9 +92,7 @@ def _parse(path: Path) -> ElementTree.Element:
         raise SceneError(f"{path} cannot be read ({error.strerror}); correct 'scene' in the site file") from error
     except UnicodeDecodeError as error:
         raise SceneError(f"{path} cannot be read as XML: it is not UTF-8; {_UNREADABLE}") from error
-    # Entities can grow without bound and name other files; no exporter writes them.
-    if re.search("<!(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-        raise SceneError(f"{path} declares a document type or entities, which is not allowed; remove <!DOCTYPE ...>")
+    refuse_hostile_xml(path, text.encode(), "utf-8")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
@@ -127,17 +143,20 @@ def _meshes(path: Path, shape: ElementTree.Element, load_mesh: Callable[[Path], 
     element = shape.find("string[@name='filename']")
     if element is None or not element.get("value"):
         raise SceneError(f'{where} names no file; add <string name="filename" value="....ply"/>')
-    file = path.parent / str(element.get("value"))
+    name = str(element.get("value"))
+    file = inside(path.parent, path.parent, name)
+    if file is None:
+        raise outside_error(where, name)
     try:
         found = file.is_file()
     except OSError:
         found = False
     if not found:
-        raise SceneError(f"{where} needs {element.get('value')}, which is not there; put it beside the scene file")
+        raise SceneError(f"{where} needs {name}, which is not there; put it beside the scene file")
     loaded = load_mesh(file)
     meshes = [mesh for mesh in loaded.geometry.values() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     if not meshes:
-        raise SceneError(f"{where}: {element.get('value')} holds no triangles; export it as a triangle mesh")
+        raise SceneError(f"{where}: {name} holds no triangles; export it as a triangle mesh")
     return meshes
 
 

@@ -16,9 +16,13 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.units import unit_conversion
 
+from rayfix_offline.scene.gltf_limits import refuse_hostile_gltf
 from rayfix_offline.scene.ifc import read_ifc
-from rayfix_offline.scene.mitsuba import read_mitsuba
+from rayfix_offline.scene.mitsuba import MOST_TRIANGLES, read_mitsuba
 from rayfix_offline.scene.placed import Placed
+from rayfix_offline.scene.scene_folder import SceneFolder, outside_error
+from rayfix_offline.scene.xml_limits import refuse_hostile_collada, refuse_hostile_xml
+from rayfix_offline.site import LARGEST_COORDINATE
 from rayfix_tables.errors import SceneError
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
@@ -106,11 +110,17 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
         raise SceneError(f"{path} is of unknown type '{kind}'; give one of {', '.join(FILE_TYPES)}")
     scale, said_up = METRES_PER_UNIT[unit], None
     if kind == "xml":
-        meshes = read_mitsuba(path, _load_quietly)
+        meshes = read_mitsuba(path, lambda mesh: _load_quietly(mesh, path.parent))
     elif kind == "ifc":
         meshes, scale, said_up = read_ifc(path), 1.0, "z"
     else:
-        loaded = _load_quietly(path)
+        if kind == "dae":
+            content = path.read_bytes()
+            refuse_hostile_xml(path, content)
+            refuse_hostile_collada(path, content)
+        elif kind in ("glb", "gltf"):
+            refuse_hostile_gltf(path, path.read_bytes())
+        loaded = _load_quietly(path, path.parent)
         meshes = _placed_meshes(loaded)
         if kind == "dae":
             # trimesh reads the unit of a COLLADA file (as "0.01 * meters"), but does not apply it.
@@ -120,10 +130,29 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
         raise SceneError(f"{path} holds no triangles; export the scene as a triangle mesh")
     if not all(np.isfinite(mesh.vertices).all() and np.isfinite(transform).all() for _, mesh, transform in meshes):
         raise SceneError(f"{path} has coordinates that are not finite; export the scene again")
+    num_triangles = sum(len(mesh.faces) for _, mesh, _ in meshes)
+    if num_triangles > MOST_TRIANGLES:
+        raise SceneError(
+            f"{path} has {num_triangles:,} triangles, more than {MOST_TRIANGLES:,}; leave out what is small"
+        )
+    _refuse_far(path, meshes, scale)
     scene = replace(_gather(meshes, scale=scale, up=said_up or up), says_up=said_up is not None)
     if not len(scene.faces):
         raise SceneError(f"{path} has only triangles without an area; export the scene again")
     return scene
+
+
+def _refuse_far(path: Path, meshes: list[Placed], scale: float) -> None:
+    """Refuse coordinates that are no building's: squares and voxels of them overflow."""
+    for name, mesh, transform in meshes:
+        with np.errstate(all="ignore"):
+            points = trimesh.transformations.transform_points(np.asarray(mesh.vertices, np.float64), transform) * scale
+            reach = np.abs(points).max(initial=0.0)
+        if not reach <= LARGEST_COORDINATE:
+            raise SceneError(
+                f"{path}: the object '{name}' has a coordinate of {reach:.6g} m, beyond {LARGEST_COORDINATE:g} m; "
+                "correct the mesh, or scene_unit in the site file"
+            )
 
 
 def _collada_up(path: Path) -> str | None:
@@ -132,19 +161,31 @@ def _collada_up(path: Path) -> str | None:
     return found[1].decode().lower() if found else None
 
 
-def _load_quietly(path: Path) -> Any:
-    """Read with trimesh, whose readers print, log and warn about what the result shows anyway."""
+def _load_quietly(path: Path, folder: Path) -> Any:
+    """Read with trimesh, whose readers print, log and warn about what the result shows anyway.
+
+    Parameters
+    ----------
+    folder : Path
+        The scene's; nothing outside it is read.
+    """
+    files = SceneFolder(folder, path.parent)
     previous = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            return trimesh.load_scene(path, process=False)
+            loaded = trimesh.load_scene(path, process=False, resolver=files)
     except Exception as error:  # the readers raise whatever their formats make of a damaged file
+        if files.refused:
+            raise outside_error(str(path), files.refused[0]) from error
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SceneError(f"{path} cannot be read as a mesh ({reason}); export the scene again") from error
     finally:
         logging.disable(previous)
+    if files.refused:
+        raise outside_error(str(path), files.refused[0])
+    return loaded
 
 
 def _placed_meshes(loaded: Any) -> list[Placed]:

@@ -177,6 +177,9 @@ def map_free_space(scene: Scene, *, solids: Sequence[Part], rooms: Sequence[Part
     low, high = scene.bounds
     extent = np.maximum(high - low, voxel_size)
     voxel_size = max(voxel_size, float((np.prod(extent) / MAX_VOXELS) ** (1.0 / 3.0)))
+    # Across a flat scene a voxel may be larger than the scene, and is one nevertheless.
+    while float(np.prod(np.ceil(extent / voxel_size))) > 2.0 * MAX_VOXELS:
+        voxel_size *= 1.1
     shape = tuple(int(n) for n in np.ceil(extent / voxel_size - 1e-9))
     free = np.full(shape, not rooms)
     for part in (*rooms, *solids):

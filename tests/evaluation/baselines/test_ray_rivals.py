@@ -110,10 +110,10 @@ def test_the_predecessor_finds_the_transmitter_at_its_height(room: Table, measur
         assert found is not None
         # 2 mrad over 3 m, the plane crossed at a slant, two or more stations: about 1 cm.
         np.testing.assert_allclose(found, UE, rtol=0, atol=0.04)
-        assert found[2] == 1.1
+        assert found[2] == pytest.approx(1.1, abs=1e-12)
     with_default = PlanarPredecessor.of_table(room, height=1.1)
     again = with_default.locate(Report(measurements=measurements))
-    np.testing.assert_array_equal(again, found)
+    np.testing.assert_allclose(again, found, rtol=0, atol=1e-9)
 
 
 def test_the_predecessor_needs_a_height_and_angles(room: Table, measure: Any) -> None:

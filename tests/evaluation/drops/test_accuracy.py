@@ -35,7 +35,7 @@ def test_the_bound_is_that_of_the_reported_paths(hall_table_path: Path, rule: Ru
     positions = np.array([s.position for s in stations if s.id in reported])
     bound = position_error_bound(positions, list(drop.paths.values()), chosen, drop.position, NOISE, timing="pt")
     assert found.bound == pytest.approx(bound, rel=1e-12)
-    assert found.error == np.linalg.norm(found.fix.position - drop.position)
+    assert found.error == pytest.approx(np.linalg.norm(found.fix.position - drop.position), rel=1e-12)
 
 
 @pytest.mark.slow

@@ -204,7 +204,8 @@ def test_a_scene_that_cannot_be_used(folder: Path, content: str, expected: str) 
         ("<mesh/>", "its root is <mesh>"),
         (b"\xff\xfe" + "<scene/>".encode("utf-16-le"), "not UTF-8"),
         ('<!DOCTYPE scene [<!ENTITY a "b">]><scene>&a;</scene>', "document type or entities"),
-        ("<!doctype scene><scene/>", "document type or entities"),
+        ("<!DOCTYPE scene><scene/>", "document type or entities"),
+        ("<!doctype scene><scene/>", "cannot be read as XML"),
         ("<scene>&a;</scene>", "cannot be read as XML"),
     ],
 )

@@ -127,7 +127,7 @@ def test_condition_on_length_equals_the_joint_gaussian(variance: float) -> None:
     factor_kernels.condition_on_length(mean, cov, 4.0, variance)
     # Evidences of 1e6 nats where a precise length is far off.
     np.testing.assert_allclose(log, expected[0][5:], rtol=1e-11)
-    np.testing.assert_array_equal(score, log - 1.0)
+    np.testing.assert_allclose(score, log - 1.0, rtol=1e-14)
     assert top == score.max()
     np.testing.assert_allclose(mean, expected[1], rtol=0, atol=1e-10)  # m
     np.testing.assert_allclose(cov, expected[2], rtol=0, atol=1e-10)  # m2

@@ -65,7 +65,7 @@ def test_a_walk_gives_position_and_velocity(send: Send):
         assert track.num_reports == n + 1
     assert np.linalg.norm(track.estimate.position - truth) < 0.2
     np.testing.assert_allclose(track.estimate.velocity, [1.0, -0.4, 0.0], atol=0.4)
-    assert track.estimate.probability == 1.0
+    assert track.estimate.probability == pytest.approx(1.0, abs=1e-12)
     # Better than one report, and not by more than it can be.
     assert 0.02 < np.sqrt(np.trace(track.estimate.covariance) / 3) < 0.1
     away = track.estimate.velocity - [1.0, -0.4, 0.0]

@@ -1,0 +1,58 @@
+"""Limits of glTF files' nodes, checked before a reader follows them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rayfix_offline.scene.xml_limits import MOST_NESTED
+from rayfix_tables.errors import SceneError
+
+_JSON_CHUNK = b"JSON"
+
+
+def refuse_hostile_gltf(path: Path, content: bytes) -> None:
+    """Refuse nodes that are in each other in a circle, in two others, or too deeply.
+
+    What is no glTF at all is left for the reader to tell.
+
+    Raises
+    ------
+    SceneError
+        When the nodes are no trees, or more than 200 deep.
+    """
+    try:
+        nodes = json.loads(_json_of(content))["nodes"]
+        children = [[int(child) for child in node.get("children", ())] for node in nodes]
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return
+    parents: dict[int, int] = {}
+    for number, each in enumerate(children):
+        for child in each:
+            if not 0 <= child < len(children):
+                return
+            if child in parents:
+                raise SceneError(f"{path} has the node {child} in two other nodes; export the scene again, as trees")
+            parents[child] = number
+    # From the roots downwards; what is in a circle has no root.
+    level, found = [number for number in range(len(children)) if number not in parents], 0
+    for depth in range(MOST_NESTED + 1):
+        if not level:
+            break
+        if depth == MOST_NESTED:
+            raise SceneError(
+                f"{path} has nodes nested more than {MOST_NESTED} deep; export the scene again, with a flatter "
+                "structure"
+            )
+        found += len(level)
+        level = [child for number in level for child in children[number]]
+    if found < len(children):
+        raise SceneError(f"{path} has nodes that lie in each other in a circle; export the scene again, as trees")
+
+
+def _json_of(content: bytes) -> Any:
+    """JSON of a file, which in a binary one is the first chunk."""
+    if content[:4] != b"glTF":
+        return content
+    if content[16:20] != _JSON_CHUNK:
+        raise ValueError("the first chunk is not JSON")
+    return content[20 : 20 + int.from_bytes(content[12:16], "little")]
