@@ -12,28 +12,16 @@ with needs_extra("service"):
     from rayfix_service.batch import locate_batch
     from rayfix_service.fusion.locator import Fused
     from rayfix_service.fusion.locator import Locator as _Locator
+    from rayfix_service.fusion.measurements.checks import check_report
     from rayfix_service.fusion.measurements.report import Report
     from rayfix_service.fusion.posterior.fix import Fix
     from rayfix_service.fusion.posterior.posterior import Posterior
     from rayfix_service.fusion.settings import FusionSettings
-    from rayfix_service.measuring.impulse_response import range_from_impulse_response
-    from rayfix_service.measuring.ranging import range_from_round_trip, range_from_rssi, range_from_times
     from rayfix_service.tracking.settings import TrackingSettings
     from rayfix_service.tracking.tracker import Tracker as _Tracker
     from rayfix_service.wire import parse_report
 
-__all__ = [
-    "Fix",
-    "Locator",
-    "Posterior",
-    "Report",
-    "Tracker",
-    "build",
-    "range_from_impulse_response",
-    "range_from_round_trip",
-    "range_from_rssi",
-    "range_from_times",
-]
+__all__ = ["Locator", "Tracker", "build"]
 
 
 def build(
@@ -105,7 +93,7 @@ class Locator(_Locator):
         ReportError
             When the report cannot be used; its ``path`` names the field.
         """
-        return super().locate(report if isinstance(report, Report) else parse_report(report))
+        return super().locate(_read(report))
 
     def locate_batch(self, reports: Sequence[Report | Mapping[str, Any]], *, jobs: int = -1) -> list[Fix | ReportError]:
         """Fuse the measurements of many reports, on several processor cores.
@@ -140,7 +128,7 @@ class Locator(_Locator):
         report : Report or mapping
             As of :meth:`locate`, and so are the errors.
         """
-        return super().posterior(report if isinstance(report, Report) else parse_report(report))
+        return super().posterior(_read(report))
 
     def fuse(self, report: Report | Mapping[str, Any]) -> Fused:
         """Fuse the measurements of a report and keep what its fix was made of, for :class:`Tracker`.
@@ -150,7 +138,12 @@ class Locator(_Locator):
         report : Report or mapping
             As of :meth:`locate`, and so are the errors.
         """
-        return super().fuse(report if isinstance(report, Report) else parse_report(report))
+        return super().fuse(_read(report))
+
+
+def _read(report: Report | Mapping[str, Any]) -> Report:
+    """Check a report, or read one from a mapping."""
+    return check_report(report) if isinstance(report, Report) else parse_report(report)
 
 
 class Tracker(_Tracker):

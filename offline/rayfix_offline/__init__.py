@@ -1,1 +1,4 @@
-"""The offline half: a site and its mesh become rays, mixtures and a table."""
+"""The offline half: a site and its mesh become rays, mixtures and a table.
+
+Its public face is ``rayfix.build`` and the command line (see :mod:`rayfix`); all modules may change without notice.
+"""

@@ -20,7 +20,6 @@ from rayfix.client.calls import (
     request,
     stream_answer,
 )
-from rayfix.client.errors import ProblemError, UnreachableError
 from rayfix.client.feed import SILENCE_SECONDS, Feed
 from rayfix.client.models import (
     FixAnswer,
@@ -35,6 +34,7 @@ from rayfix.client.models import (
 from rayfix.client.retries import NO_RETRIES, RetryPolicy
 from rayfix.client.settings import ClientSettings
 from rayfix.client.waiting import async_connect, async_pause, async_receive
+from rayfix.errors import ProblemError, UnreachableError
 from rayfix.extras import needs_extra
 
 with needs_extra("client"):
