@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: viewer browser screenshots demo test test-portable lint types package images accuracy openapi clean
+.PHONY: client viewer browser screenshots demo test test-portable lint types package images accuracy openapi clean
 
 # The environment is made anew when what it holds has changed.
 $(VENV)/.done: pyproject.toml constraints.txt
@@ -47,6 +47,11 @@ lint: $(VENV)/.done
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports --no-cache
+	$(BIN)/python tools/generate_client.py --check
+
+# The blocking client, from the asynchronous one.
+client: $(VENV)/.done
+	$(BIN)/python tools/generate_client.py
 
 types: $(VENV)/.done
 	$(BIN)/mypy

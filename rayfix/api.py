@@ -12,29 +12,17 @@ with needs_extra("service"):
     from rayfix_service.batch import locate_batch
     from rayfix_service.fusion.locator import Fused
     from rayfix_service.fusion.locator import Locator as _Locator
+    from rayfix_service.fusion.measurements.checks import check_report
     from rayfix_service.fusion.measurements.report import Report
     from rayfix_service.fusion.posterior.fix import Fix
     from rayfix_service.fusion.posterior.posterior import Posterior
     from rayfix_service.fusion.settings import FusionSettings
     from rayfix_service.fusion.stopping import NEVER, Stop
-    from rayfix_service.measuring.impulse_response import range_from_impulse_response
-    from rayfix_service.measuring.ranging import range_from_round_trip, range_from_rssi, range_from_times
     from rayfix_service.tracking.settings import TrackingSettings
     from rayfix_service.tracking.tracker import Tracker as _Tracker
     from rayfix_service.wire import parse_report
 
-__all__ = [
-    "Fix",
-    "Locator",
-    "Posterior",
-    "Report",
-    "Tracker",
-    "build",
-    "range_from_impulse_response",
-    "range_from_round_trip",
-    "range_from_rssi",
-    "range_from_times",
-]
+__all__ = ["Locator", "Tracker", "build"]
 
 
 def build(
@@ -110,7 +98,7 @@ class Locator(_Locator):
         FixStoppedError
             When it was stopped.
         """
-        return super().locate(report if isinstance(report, Report) else parse_report(report), stop=stop)
+        return super().locate(_read(report), stop=stop)
 
     def locate_batch(self, reports: Sequence[Report | Mapping[str, Any]], *, jobs: int = -1) -> list[Fix | ReportError]:
         """Fuse the measurements of many reports, on several processor cores.
@@ -147,7 +135,7 @@ class Locator(_Locator):
         stop : rayfix_service.fusion.stopping.Stop, optional
             As of :meth:`locate`.
         """
-        return super().posterior(report if isinstance(report, Report) else parse_report(report), stop=stop)
+        return super().posterior(_read(report), stop=stop)
 
     def fuse(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Fused:
         """Fuse the measurements of a report and keep what its fix was made of, for :class:`Tracker`.
@@ -159,7 +147,12 @@ class Locator(_Locator):
         stop : rayfix_service.fusion.stopping.Stop, optional
             As of :meth:`locate`.
         """
-        return super().fuse(report if isinstance(report, Report) else parse_report(report), stop=stop)
+        return super().fuse(_read(report), stop=stop)
+
+
+def _read(report: Report | Mapping[str, Any]) -> Report:
+    """Check a report, or read one from a mapping."""
+    return check_report(report) if isinstance(report, Report) else parse_report(report)
 
 
 class Tracker(_Tracker):

@@ -3,11 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rayfix_tables.errors import RayfixError
-
-
-class MissingExtraError(RayfixError, ImportError):
-    """A part of rayfix is used whose dependencies are not installed."""
+from rayfix.errors import MissingExtraError
 
 
 @contextmanager
@@ -23,6 +19,7 @@ def needs_extra(extra: str) -> Iterator[None]:
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] in {
             "rayfix",
+            "rayfix_evaluation",
             "rayfix_offline",
             "rayfix_service",
             "rayfix_tables",

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rayfix.errors import ViewError
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.web.assets import INDEX, STATIC
 from rayfix_service.web.glb import write_glb
@@ -17,14 +18,10 @@ from rayfix_service.web.viewer_settings import picture_posterior, viewer_setting
 from rayfix_service.wire import InvalidReportError, fix_to_document, parse_report, read_json
 from rayfix_service.wire.table import station_summary, table_summary
 from rayfix_tables.checked import open_checked
-from rayfix_tables.errors import RayfixError, ReportError
+from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
 
 _PAGES = (".html", ".htm")
-
-
-class ViewError(RayfixError):
-    """The page cannot be written."""
 
 
 def write_view(table_path: Path, output: Path, report_path: Path | None = None) -> int:

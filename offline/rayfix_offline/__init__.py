@@ -1,4 +1,7 @@
-"""The offline half: a site and its mesh become rays, mixtures and a table."""
+"""The offline half: a site and its mesh become rays, mixtures and a table.
+
+Its public face is ``rayfix.build`` and the command line (see :mod:`rayfix`); all modules may change without notice.
+"""
 
 from pathlib import Path
 

@@ -4,13 +4,6 @@ It needs the extra ``rayfix[client]`` alone, neither that of the service nor any
 """
 
 from rayfix.client.asynchronous import AsyncClient
-from rayfix.client.errors import (
-    AnswerError,
-    ClientError,
-    ProblemError,
-    RefusedReportError,
-    UnreachableError,
-)
 from rayfix.client.models import (
     Candidate,
     FixAnswer,
@@ -23,6 +16,13 @@ from rayfix.client.models import (
 )
 from rayfix.client.retries import RetryPolicy
 from rayfix.client.synchronous import Client
+from rayfix.errors import (
+    AnswerError,
+    ClientError,
+    ProblemError,
+    RefusedReportError,
+    UnreachableError,
+)
 
 __all__ = [
     "AnswerError",

@@ -1,6 +1,5 @@
-"""The client for asyncio."""
+"""The client for asyncio; ``make client`` generates the blocking one from it."""
 
-import asyncio
 from collections.abc import AsyncIterable, AsyncIterator, Callable, Iterable, Mapping
 from functools import partial
 from random import Random
@@ -21,7 +20,6 @@ from rayfix.client.calls import (
     request,
     stream_answer,
 )
-from rayfix.client.errors import ProblemError, UnreachableError
 from rayfix.client.feed import SILENCE_SECONDS, Feed
 from rayfix.client.models import (
     FixAnswer,
@@ -35,6 +33,8 @@ from rayfix.client.models import (
 )
 from rayfix.client.retries import NO_RETRIES, RetryPolicy
 from rayfix.client.settings import ClientSettings
+from rayfix.client.waiting import async_connect, async_pause, async_receive
+from rayfix.errors import ProblemError, UnreachableError
 from rayfix.extras import needs_extra
 
 with needs_extra("client"):
@@ -164,14 +164,14 @@ class AsyncClient:
                             event = feed.take(line)
                             if event is not None:
                                 yield event
-                        pause = feed.lost("the service ended it")
+                        seconds = feed.lost("the service ended it")
                     else:
-                        pause = feed.refused(
+                        seconds = feed.refused(
                             answer.status_code, await answer.aread(), answer.headers.get("retry-after")
                         )
             except httpx.TransportError as error:
-                pause = feed.lost(reason_of(error))
-            await asyncio.sleep(pause)
+                seconds = feed.lost(reason_of(error))
+            await async_pause(seconds)
 
     async def stream(
         self, reports: AsyncIterable[Mapping[str, Any] | object]
@@ -181,15 +181,12 @@ class AsyncClient:
         For one sender of many reports this is faster than requests. A lost connection is not made again.
         """
         with needs_extra("client"):
-            from websockets.asyncio.client import connect
             from websockets.exceptions import WebSocketException
         try:
-            async with connect(self.settings.stream_url, additional_headers=self.settings.headers) as socket:
+            async with async_connect(self.settings.stream_url, self.settings.headers) as socket:
                 async for report in reports:
                     await socket.send(report_bytes(report), text=True)
-                    async with asyncio.timeout(self.settings.timeout):
-                        answer = stream_answer(await socket.recv())
-                    yield answer
+                    yield stream_answer(await async_receive(socket, self.settings.timeout))
         except (OSError, WebSocketException) as error:
             raise UnreachableError(f"the stream is lost ({reason_of(error)}); is the service still there?") from None
 
@@ -206,7 +203,7 @@ class AsyncClient:
                 return result
             reply = None
             if isinstance(wanted, Pause):
-                await asyncio.sleep(wanted.seconds)
+                await async_pause(wanted.seconds)
             else:
                 reply = await self._send(wanted)
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any, TypeVar
 
-from rayfix.client.errors import AnswerError, ProblemError, ProblemField, RefusedReportError, UnreachableError
 from rayfix.client.models import FixAnswer, fix_answer
 from rayfix.client.retries import RetryPolicy, is_temporary
+from rayfix.errors import AnswerError, ProblemError, ProblemField, RefusedReportError, UnreachableError
 
 T = TypeVar("T")
 

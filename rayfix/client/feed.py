@@ -4,10 +4,10 @@ import json
 from random import Random
 
 from rayfix.client.calls import problem
-from rayfix.client.errors import AnswerError, UnreachableError
 from rayfix.client.events import EventReader
 from rayfix.client.models import FixEvent, fix_event
 from rayfix.client.retries import RetryPolicy, is_temporary
+from rayfix.errors import AnswerError, UnreachableError
 
 SILENCE_SECONDS = 45.0
 """The service writes something every 15 s; after this long without, the connection is lost."""

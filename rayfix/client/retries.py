@@ -4,6 +4,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from random import Random
+from typing import Annotated
+
+from rayfix_tables.limits import Limits, check_limits
 
 _AGAIN = frozenset({429, 502, 503, 504})
 """Statuses of a service that is busy, starting, or behind a proxy that cannot reach it."""
@@ -25,13 +28,22 @@ class RetryPolicy:
         longest: clients that lost the service together do not come back together ("full jitter": M. Brooker,
         "Exponential backoff and jitter", 2015).
     longest_retry_after : float, s
-        A service that asks for more patience than this is not waited for.
+        A service that asks for a longer pause than this is not asked again.
+
+    Raises
+    ------
+    SettingsError
+        When a value is out of its range.
     """
 
-    attempts: int = 5
-    first_pause: float = 0.2
-    longest_pause: float = 10.0
-    longest_retry_after: float = 60.0
+    attempts: Annotated[int, Limits(least=1)] = 5
+    first_pause: Annotated[float, Limits(least=0.0)] = 0.2
+    longest_pause: Annotated[float, Limits(least=0.0)] = 10.0
+    longest_retry_after: Annotated[float, Limits(least=0.0)] = 60.0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_limits(self)
 
     def pause(self, attempt: int, random: Random, retry_after: str | None = None) -> float | None:
         """Pause after the attempt of that number, from 1 on; None where there is to be no other, s.

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from urllib.parse import urlencode, urlsplit
 
-from rayfix.client.errors import ClientError
 from rayfix.client.retries import RetryPolicy
+from rayfix.errors import ClientError
 
 
 @dataclass(frozen=True, kw_only=True)

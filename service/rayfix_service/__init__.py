@@ -1,4 +1,8 @@
-"""The online half: a report and a table become a position, in Python (``fusion``) and over HTTP (``http``)."""
+"""The online half: a report and a table become a position, in Python (``fusion``) and over HTTP (``http``).
+
+The public names are those that :mod:`rayfix` takes from here. The command line is public, too, and so is the HTTP
+interface that docs/openapi.json describes; modules may change without notice.
+"""
 
 from pathlib import Path
 

@@ -16,6 +16,7 @@ from typing import Any
 from joblib import Parallel, delayed, effective_n_jobs
 
 from rayfix_service.fusion.locator import Locator
+from rayfix_service.fusion.measurements.checks import check_report
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
@@ -78,7 +79,7 @@ def _locate_block(locator: Locator, reports: Sequence[Report | Mapping[str, Any]
     answers: list[Fix | ReportError] = []
     for report in reports:
         try:
-            answers.append(locator.locate(report if isinstance(report, Report) else parse_report(report)))
+            answers.append(locator.locate(check_report(report) if isinstance(report, Report) else parse_report(report)))
         except ReportError as error:
             error.__traceback__ = error.__context__ = None  # they keep the report, and all that was made of it
             answers.append(error)

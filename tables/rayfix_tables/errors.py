@@ -1,4 +1,4 @@
-"""Every error that rayfix raises on purpose.
+"""The errors that the table and both halves raise on purpose; ``rayfix.errors`` draws all of them.
 
 ::
 
@@ -10,7 +10,8 @@
     │   ├── NotATableError      not an HDF5 file, or another program's
     │   ├── FormatVersionError  written by an incompatible version of rayfix
     │   └── CorruptTableError   truncated, or a checksum does not match
-    └── ReportError             a report that cannot be used; ``path`` names the field
+    ├── ReportError             a report that cannot be used; ``path`` names the field
+    └── SettingsError           settings of the fusion, the tracking or the client: a value out of range
 
 Anything else that escapes is a defect of rayfix.
 """
@@ -23,6 +24,7 @@ __all__ = [
     "RayfixError",
     "ReportError",
     "SceneError",
+    "SettingsError",
     "SiteError",
     "TableError",
 ]
@@ -74,3 +76,7 @@ class ReportError(RayfixError):
     def __init__(self, message: str, *, path: tuple[str | int, ...] = ()) -> None:
         super().__init__(message)
         self.path = path
+
+
+class SettingsError(RayfixError, ValueError):
+    """A setting is out of its range."""

@@ -1,6 +1,11 @@
 """Settings of the fusion."""
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from rayfix_tables.limits import Limits, check_limits
+
+Probability = Annotated[float, Limits(above=0.0, below=1.0)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,18 +43,27 @@ class FusionSettings:
         An ambiguous fix of which not even this many candidates together are that probable is ``insufficient``.
     insufficient_above : float, m
         A best candidate whose largest standard deviation is above this makes the fix ``insufficient``.
+
+    Raises
+    ------
+    SettingsError
+        When a value is out of its range.
     """
 
-    outlier_probability: float = 0.01
-    sight_error: float = 0.05
-    beam_width: int = 2048
-    most_alternatives: int = 8192
-    most_considered: int = 2**23
-    considered_tables: int = 64
-    most_products: int = 2**28
-    max_divergence: float = 5e-3
-    component_floor: float = 1e-6
-    hypothesis_floor: float = 1e-5
-    ambiguous_below: float = 0.7
-    most_rivals: int = 3
-    insufficient_above: float = 3.0
+    outlier_probability: Probability = 0.01
+    sight_error: Annotated[float, Limits(above=0.0, most=0.5)] = 0.05
+    beam_width: Annotated[int, Limits(least=1)] = 2048
+    most_alternatives: Annotated[int, Limits(least=1)] = 8192
+    most_considered: Annotated[int, Limits(least=1)] = 2**23
+    considered_tables: Annotated[int, Limits(least=1)] = 64
+    most_products: Annotated[int, Limits(least=1)] = 2**28
+    max_divergence: Annotated[float, Limits(least=0.0)] = 5e-3
+    component_floor: Probability = 1e-6
+    hypothesis_floor: Probability = 1e-5
+    ambiguous_below: Probability = 0.7
+    most_rivals: Annotated[int, Limits(least=1)] = 3
+    insufficient_above: Annotated[float, Limits(above=0.0)] = 3.0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_limits(self)

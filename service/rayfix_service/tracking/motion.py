@@ -10,11 +10,15 @@ Gaussian's variance depends on where the particle went, so all particles share i
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_tables.limits import Limits, check_limits
+
 Array = NDArray[np.float64]
+Positive = Annotated[float, Limits(above=0.0)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,12 +32,21 @@ class MotionModel:
         by a Gaussian of this variance.
     speed_stdev, vertical_speed_stdev : float, m / s
         Of each component of the velocity of a target that has just been seen for the first time.
+
+    Raises
+    ------
+    SettingsError
+        When a value is out of its range.
     """
 
-    acceleration_density: float = 0.5
-    vertical_acceleration_density: float = 0.02
-    speed_stdev: float = 1.0
-    vertical_speed_stdev: float = 0.2
+    acceleration_density: Positive = 0.5
+    vertical_acceleration_density: Positive = 0.02
+    speed_stdev: Positive = 1.0
+    vertical_speed_stdev: Positive = 0.2
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_limits(self)
 
     @property
     def density(self) -> Array:

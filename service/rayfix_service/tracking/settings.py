@@ -1,8 +1,12 @@
 """Settings of the tracking."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from rayfix_service.tracking.motion import MotionModel
+from rayfix_service.tracking.motion import MotionModel, Positive
+from rayfix_tables.limits import Limits, check_limits
+
+Count = Annotated[int, Limits(least=1)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,14 +33,23 @@ class TrackingSettings:
         Targets not heard of for this time, of the service's own clock, are forgotten.
     seed : int
         Of the random numbers, of which every target has its own.
+
+    Raises
+    ------
+    SettingsError
+        When a value is out of its range.
     """
 
     motion: MotionModel = field(default_factory=MotionModel)
-    num_particles: int = 512
-    restart_probability: float = 1e-4
-    longest_gap: float = 5.0
-    longest_step: float = 0.5
-    height_seconds: float = 10.0
-    max_targets: int = 1000
-    max_age: float = 60.0
-    seed: int = 1
+    num_particles: Count = 512
+    restart_probability: Annotated[float, Limits(above=0.0, below=1.0)] = 1e-4
+    longest_gap: Positive = 5.0
+    longest_step: Positive = 0.5
+    height_seconds: Positive = 10.0
+    max_targets: Count = 1000
+    max_age: Positive = 60.0
+    seed: Annotated[int, Limits(least=0)] = 1
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_limits(self)

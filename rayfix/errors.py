@@ -1,0 +1,134 @@
+"""Every error that rayfix raises on purpose.
+
+::
+
+    RayfixError                     root; ``str(error)`` is one line that names the culprit and the remedy
+    ├── SiteError                   the site file: unreadable, unknown key, value out of range
+    ├── SceneError                  the mesh: missing, unreadable, empty, a station where none can be
+    ├── BuildError                  the offline job: no space left, no ray came back
+    ├── TableError                  a table file
+    │   ├── NotATableError          not an HDF5 file, or another program's
+    │   ├── FormatVersionError      written by an incompatible version of rayfix
+    │   └── CorruptTableError       truncated, or a checksum does not match
+    ├── ReportError                 a report that cannot be used; ``path`` names the field
+    │   ├── MalformedJsonError      its JSON cannot be read
+    │   ├── InvalidReportError      its JSON does not have the form of a report
+    │   └── RefusedReportError      a service refused it; see below
+    ├── SettingsError               a setting out of its range; a ValueError
+    ├── MissingExtraError           an optional dependency is not installed; an ImportError
+    ├── ClientError                 between a client and the service
+    │   ├── UnreachableError        no connection, or no answer in time
+    │   ├── AnswerError             an answer that is not one of this service
+    │   └── ProblemError            a problem document (RFC 9457): kind, status, errors
+    │       └── RefusedReportError  that of a report
+    ├── ServiceError                ``rayfix serve`` cannot start as it is told to
+    ├── BrokerError                 ``rayfix mqtt``: the MQTT broker
+    ├── HubError                    the address of an omlox hub
+    └── ViewError                   ``rayfix view``: the page cannot be written
+
+Anything else that escapes is a defect of rayfix. All of these but two are in the package ``rayfix``: malformed and
+invalid reports are caught as :class:`ReportError`.
+"""
+
+from dataclasses import dataclass
+
+from rayfix_tables.errors import (
+    BuildError,
+    CorruptTableError,
+    FormatVersionError,
+    NotATableError,
+    RayfixError,
+    ReportError,
+    SceneError,
+    SettingsError,
+    SiteError,
+    TableError,
+)
+
+__all__ = [
+    "AnswerError",
+    "BuildError",
+    "ClientError",
+    "CorruptTableError",
+    "FormatVersionError",
+    "MissingExtraError",
+    "NotATableError",
+    "ProblemError",
+    "ProblemField",
+    "RayfixError",
+    "RefusedReportError",
+    "ReportError",
+    "SceneError",
+    "SettingsError",
+    "SiteError",
+    "TableError",
+    "UnreachableError",
+    "ViewError",
+]
+
+
+class MissingExtraError(RayfixError, ImportError):
+    """A part of rayfix is used whose dependencies are not installed."""
+
+
+class ViewError(RayfixError):
+    """The page of ``rayfix view`` cannot be written."""
+
+
+class ClientError(RayfixError):
+    """Something went wrong between the client and the service."""
+
+
+class UnreachableError(ClientError):
+    """The service cannot be reached, or does not answer in time."""
+
+
+class AnswerError(ClientError):
+    """The answer is not one of this service: the address is another's, or a proxy's answered."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProblemField:
+    """One offending field.
+
+    Attributes
+    ----------
+    path : str
+        Such as ``measurements[0].azimuth_deg``; empty for the whole document.
+    message : str
+    """
+
+    path: str
+    message: str
+
+
+class ProblemError(ClientError):
+    """The service answered with a problem document.
+
+    Parameters
+    ----------
+    detail : str
+        What is wrong this time, and what to do about it.
+    kind : str
+        URI of the kind of problem.
+    status : int
+        The HTTP status.
+    errors : tuple of ProblemField
+    """
+
+    def __init__(self, detail: str, *, kind: str, status: int, errors: tuple[ProblemField, ...] = ()) -> None:
+        super().__init__(detail)
+        self.kind = kind
+        self.status = status
+        self.errors = errors
+
+
+class RefusedReportError(ProblemError, ReportError):
+    """A report that the service cannot use.
+
+    ``path`` has one element, the first offending field as the service writes it; ``errors`` has all.
+    """
+
+    def __init__(self, detail: str, *, kind: str, status: int, errors: tuple[ProblemField, ...] = ()) -> None:
+        ProblemError.__init__(self, detail, kind=kind, status=status, errors=errors)
+        self.path = (errors[0].path,) if errors and errors[0].path else ()

@@ -1,0 +1,88 @@
+"""Checks of a report that was built in Python; one that comes as JSON is checked while it is read."""
+
+import math
+
+from rayfix_service.fusion.measurements.report import (
+    Angle,
+    ErrorModel,
+    Height,
+    LogRange,
+    Measurement,
+    Range,
+    Report,
+    TimeDifference,
+    TimeOfArrival,
+)
+from rayfix_tables.errors import ReportError
+from rayfix_tables.limits import Limits
+
+_FINITE = Limits()
+_STDEV = Limits(above=0.0)
+_PROBABILITY = Limits(least=0.0, most=1.0)
+_TURN = Limits(least=-2.0 * math.pi, most=2.0 * math.pi)
+
+_LIMITS: dict[type, dict[str, Limits]] = {
+    Angle: {
+        "azimuth": _TURN,
+        "azimuth_stdev": _STDEV,
+        "zenith": Limits(least=0.0, most=math.pi),
+        "zenith_stdev": _STDEV,
+        "correlation": Limits(above=-1.0, below=1.0),
+        "los_probability": _PROBABILITY,
+    },
+    Range: {"path_length": _FINITE, "stdev": _STDEV, "los_probability": _PROBABILITY},
+    LogRange: {"path_length": Limits(above=0.0), "log_stdev": _STDEV},
+    TimeOfArrival: {"path_length": _FINITE, "stdev": _STDEV, "los_probability": _PROBABILITY},
+    TimeDifference: {"length_difference": _FINITE, "stdev": _STDEV},
+    Height: {"z": _FINITE, "stdev": _STDEV},
+    ErrorModel: {"tail_share": Limits(least=0.0, below=1.0), "tail_scale": Limits(least=1.0)},
+    Report: {"confidence": Limits(above=0.0, below=1.0)},
+}
+_OPTIONAL = frozenset({"zenith", "zenith_stdev", "los_probability"})
+_KINDS = "an Angle, a Range, a LogRange, a TimeOfArrival or a TimeDifference"
+
+
+def check_report(report: Report) -> Report:
+    """Return the report, if all its numbers are in their ranges.
+
+    Parameters
+    ----------
+    report : Report
+
+    Raises
+    ------
+    ReportError
+        When a number is out of its range or missing, or a measurement is of no known kind; ``path`` names the field.
+    """
+    _check(report, ())
+    if report.height is not None:
+        _check(report.height, ("height",))
+    for index, measurement in enumerate(report.measurements):
+        path = ("measurements", index)
+        if not isinstance(measurement, Measurement):
+            raise ReportError(f"measurements[{index}] is {measurement!r}; give {_KINDS}", path=path)
+        _check(measurement, path)
+        if not isinstance(measurement, LogRange):
+            _check(measurement.error_model, (*path, "error_model"))
+        if isinstance(measurement, Angle) and (measurement.zenith is None) != (measurement.zenith_stdev is None):
+            missing = "zenith" if measurement.zenith is None else "zenith_stdev"
+            _refuse((*path, missing), None, "a number, or neither zenith nor zenith_stdev")
+    return report
+
+
+def _check(part: object, path: tuple[str | int, ...]) -> None:
+    for name, limits in _LIMITS[type(part)].items():
+        value = getattr(part, name)
+        if value is None and name in _OPTIONAL:
+            continue
+        try:
+            within = limits.hold(value)
+        except TypeError:
+            within = False
+        if not within:
+            _refuse((*path, name), value, f"a finite number {limits}".rstrip())
+
+
+def _refuse(path: tuple[str | int, ...], value: object, wanted: str) -> None:
+    text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).removeprefix(".")
+    raise ReportError(f"{text} is {value!r}; give {wanted}", path=path)
