@@ -21,7 +21,8 @@ from fit_settings import SETTINGS, Setting
 from held_out import REFERENCE_RATIO, log_densities, processor_seconds, trace_sliced
 from rayfix.example.files import write_example
 from rayfix_offline.fit.em import fit_em, sample_points
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.fit.settings import TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.job.plan import BLOCK_CELLS
 from rayfix_offline.rays.trace import LevelRays, level_grid
 from rayfix_offline.site import SiteFile, read_site

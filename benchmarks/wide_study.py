@@ -22,9 +22,10 @@ from held_out import COMPONENT_BYTES, REFERENCE_RATIO, log_density_as_measured, 
 from rayfix.example.files import write_example
 from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly, locate_drops
 from rayfix_evaluation.drops.simulate import Noise
-from rayfix_offline.fit.em import ExpectationMaximisation, fit_em, sample_points
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
-from rayfix_offline.fit.wide_windows import CoarseFit, sum_cells
+from rayfix_offline.fit.em import fit_em, sample_points
+from rayfix_offline.fit.settings import CoarseFit, ExpectationMaximisation, TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
+from rayfix_offline.fit.wide_windows import sum_cells
 from rayfix_offline.rays.trace import LevelRays, level_grid
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin.twin import prepare_twin

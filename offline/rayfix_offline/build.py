@@ -16,12 +16,13 @@ import numpy as np
 from joblib import Parallel, delayed
 
 from rayfix_offline.fit.normalise import balanced
+from rayfix_offline.job.method import Method
 from rayfix_offline.job.plan import StationPlan, plan_build
 from rayfix_offline.job.previous_table import read_former
 from rayfix_offline.job.shards import ShardStore
 from rayfix_offline.job.station import BuiltStation, Job, StationProgress, build_station, keep_station
 from rayfix_offline.rays.lost_rays import LOST_RAYS_WARNING
-from rayfix_offline.site import SiteFile, read_site
+from rayfix_offline.site import read_site
 from rayfix_offline.twin.twin import Twin, prepare_twin, refuse_errors
 from rayfix_tables.errors import BuildError
 from rayfix_tables.version import software_version
@@ -129,15 +130,17 @@ def build_table(
     site = read_site(site_path)
     check_writable(table_path)
     report("reading the scene", 0, 0)
-    twin = prepare_twin(site, site_path.parent)
+    method = Method()
+    twin = prepare_twin(site, site_path.parent, method.twin)
     refuse_errors(twin)
-    plans = plan_build(site, twin)
+    plans = plan_build(site, twin, method)
     job = Job(
         site=site,
         twin=twin,
+        method=method,
         store=ShardStore.beside(table_path),
         jobs=jobs,
-        former=read_former(Path(former) if former is not None else table_path, required=former is not None),
+        former=read_former(Path(former) if former is not None else table_path, method, required=former is not None),
         tolerance=tolerance,
     )
     total = sum(plan.num_cells for plan in plans)
@@ -149,12 +152,12 @@ def build_table(
             station = keep_station(plan, job)
             if station is None:
                 if cluster is not None and remote is None:
-                    remote = stack.enter_context(_connect(cluster, site, twin))
+                    remote = stack.enter_context(_connect(cluster, job))
                 station = build_station(plan, job, remote, _after(done, total, report))
             built.append(station)
             done += plan.num_cells
     report("balancing", done, total)
-    built = _balanced(built, site, twin, jobs)
+    built = _balanced(built, job)
     contents = [station.content for station in built]
     if not any(len(level.mixture) for content in contents for level in content.levels):
         raise BuildError("no ray of any station finds free space; check the stations' positions and fields of view")
@@ -178,15 +181,16 @@ def build_table(
     )
 
 
-def _balanced(stations: list[BuiltStation], site: SiteFile, twin: Twin, jobs: int) -> list[BuiltStation]:
+def _balanced(stations: list[BuiltStation], job: Job) -> list[BuiltStation]:
     """Balance all levels, if their prior makes the probabilities of the paths to a place add up to 1.
 
     A part that was kept whole is of the same free space, so that its balance holds.
     """
-    if site.propagation.path_prior != "power":
+    if job.site.propagation.path_prior != "power":
         return stations
     levels = [level for station in stations if not _keeps_balance(station) for level in station.content.levels]
-    done = iter(Parallel(n_jobs=jobs, prefer="threads")(delayed(balanced)(level, twin.free_space) for level in levels))
+    tasks = (delayed(balanced)(level, job.twin.free_space, job.method.balance) for level in levels)
+    done = iter(Parallel(n_jobs=job.jobs, prefer="threads")(tasks))
     return [
         station
         if _keeps_balance(station)
@@ -203,7 +207,7 @@ def _keeps_balance(station: BuiltStation) -> bool:
     return station.origin == "kept" and all(len(level.log_balance) == len(level.mixture) for level in levels)
 
 
-def _connect(address: str, site: SiteFile, twin: Twin) -> "Cluster":
+def _connect(address: str, job: Job) -> "Cluster":
     """Connect to a cluster; only this needs Dask."""
     try:
         from rayfix_offline.job.cluster import Cluster
@@ -211,7 +215,7 @@ def _connect(address: str, site: SiteFile, twin: Twin) -> "Cluster":
         raise BuildError(
             f"the module '{error.name}' is not installed; install it with: pip install 'rayfix[cluster]'"
         ) from error
-    return Cluster(address, site, twin.scene)
+    return Cluster(address, job.site, job.twin.scene, job.method)
 
 
 def _lost_ray_warnings(plans: tuple[StationPlan, ...], contents: list[StationContent], twin: Twin) -> Iterator[str]:

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.fit.em import ExpectationMaximisation, fit_em
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
-from rayfix_offline.fit.wide_windows import CoarseFit, sum_cells
+from rayfix_offline.fit.em import fit_em
+from rayfix_offline.fit.settings import CoarseFit, ExpectationMaximisation, TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
+from rayfix_offline.fit.wide_windows import sum_cells
 from rayfix_offline.rays.trace import LevelRays
-from rayfix_offline.site import SiteFile
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
@@ -85,22 +85,27 @@ def _places(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.
     return np.repeat(starts - (ends - counts), counts) + np.arange(counts.sum())
 
 
-def fit_cells(cells: NDArray[np.int64], level: LevelRays, site: SiteFile) -> FittedCells:
-    """Fit cells of a level in the way that the site asks for."""
+def fit_cells(cells: NDArray[np.int64], level: LevelRays, fit: TubeFit | ExpectationMaximisation) -> FittedCells:
+    """Fit cells of a level to its rays."""
     centres = level.grid.centres[cells]
-    if site.table.fit == "em":
-        counts, log_mass, mixture = fit_em(centres, cells, level, ExpectationMaximisation(seed=site.table.seed))
+    if isinstance(fit, ExpectationMaximisation):
+        counts, log_mass, mixture = fit_em(centres, cells, level, fit)
     else:
-        counts, log_mass, mixture = fit_tubes(centres, level, TubeFit())
+        counts, log_mass, mixture = fit_tubes(centres, level, fit)
     change = np.zeros(len(cells), np.float32)
     return FittedCells(cells=cells, counts=counts, log_mass=log_mass, change=change, mixture=mixture)
 
 
 def widen_cells(
-    cells: NDArray[np.int64], window: float, grid: AngularGrid, finer: Level, finer_change: NDArray[np.float32]
+    cells: NDArray[np.int64],
+    window: float,
+    grid: AngularGrid,
+    finer: Level,
+    finer_change: NDArray[np.float32],
+    fit: CoarseFit,
 ) -> FittedCells:
     """Make cells of a wide window [rad] from those of the next finer level; see :func:`sum_cells`."""
-    summed = sum_cells(grid.centres[cells], window, finer, finer_change, CoarseFit())
+    summed = sum_cells(grid.centres[cells], window, finer, finer_change, fit)
     return FittedCells(
         cells=cells,
         counts=summed.counts,

@@ -5,7 +5,7 @@ Points are drawn from a cell's weighted ray pieces and a full-covariance Gaussia
 """
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,30 +13,11 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
-from rayfix_offline.fit.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR
+from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit
 from rayfix_offline.fit.tubes import joint_to_tubes
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_tables.angles import tangent, wrap
 from rayfix_tables.mixture import TubeMixture
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExpectationMaximisation:
-    """Settings of the fit.
-
-    Attributes
-    ----------
-    num_points : int
-        Points drawn for a cell.
-    num_components : tuple of int
-        Numbers of components among which BIC chooses.
-    seed : int
-        Each cell draws with the seed (seed, cell).
-    """
-
-    num_points: int = 3000
-    num_components: tuple[int, ...] = (4, 8, 16)
-    seed: int = 1
 
 
 def fit_em(
@@ -56,7 +37,7 @@ def fit_em(
     with threadpool_limits(limits=1):
         for n, (centre, cell) in enumerate(zip(centres, cells, strict=True)):
             rng = np.random.default_rng([fit.seed, int(cell)])
-            points, num_reflections, mass = sample_points(centre, level, fit.num_points, rng)
+            points, num_reflections, mass = sample_points(centre, level, fit.num_points, rng, cutoff=fit.cutoff)
             if not len(points):
                 continue
             log_mass[n] = np.log(mass)
@@ -66,9 +47,19 @@ def fit_em(
 
 
 def sample_points(
-    centre: NDArray[np.float64], level: LevelRays, count: int, rng: np.random.Generator
+    centre: NDArray[np.float64],
+    level: LevelRays,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    cutoff: float = RayFit.cutoff,
 ) -> tuple[NDArray[np.float64], NDArray[np.int8], float]:
     """Draw points from the measure of a cell.
+
+    Parameters
+    ----------
+    cutoff : float
+        Rays are gathered within this many standard deviations of the window.
 
     Returns
     -------
@@ -79,14 +70,14 @@ def sample_points(
         The cell's mass.
     """
     rays, pieces, sequences = level.rays, level.pieces, level.sequences
-    reach = CUTOFF * level.window
+    reach = cutoff * level.window
     near = np.flatnonzero(
         (np.abs(rays.zenith - centre[1]) <= reach)
         & (np.abs(wrap(rays.azimuth - centre[0])) * np.sin(centre[1]) <= reach)
     )
     offset = tangent(rays.azimuth[near], rays.zenith[near], centre[0], centre[1])
     square = np.einsum("ij,ij->i", offset, offset) / level.window**2
-    inside = square <= CUTOFF**2
+    inside = square <= cutoff**2
     near, offset, square = near[inside], offset[inside], square[inside]
     density = np.exp(-0.5 * square) / (2.0 * np.pi * level.window**2) * rays.solid_angle[near]
     chosen = pieces.of_rays(near)
@@ -116,13 +107,15 @@ def sample_points(
 def _fit_points(
     points: NDArray[np.float64], num_reflections: NDArray[np.int8], fit: ExpectationMaximisation, seed: int
 ) -> TubeMixture:
-    scale = np.maximum(points.std(axis=0), 1e-6)
+    scale = np.maximum(points.std(axis=0), fit.least_scale)
     scaled = (points - points.mean(axis=0)) / scale
     best: tuple[float, GaussianMixture] | None = None
     for num_components in fit.num_components:
-        mixture = GaussianMixture(num_components, reg_covar=1e-6, random_state=seed, max_iter=200)
+        mixture = GaussianMixture(
+            num_components, reg_covar=fit.regularisation, random_state=seed, max_iter=fit.max_rounds
+        )
         with warnings.catch_warnings():
-            # A mixture that has not settled after 200 rounds is judged by its BIC like any other.
+            # A mixture that has not settled after the last round is judged by its BIC like any other.
             warnings.simplefilter("ignore", ConvergenceWarning)
             mixture.fit(scaled)
         bic = float(mixture.bic(scaled))
@@ -130,7 +123,7 @@ def _fit_points(
             best = (bic, mixture)
     assert best is not None
     chosen = best[1]
-    floor = np.array([0.0, 0.0, 0.0, POSITION_FLOOR, POSITION_FLOOR, POSITION_FLOOR]) ** 2
+    floor = np.array([0.0, 0.0, 0.0, fit.position_floor, fit.position_floor, fit.position_floor]) ** 2
     cov = chosen.covariances_ * np.outer(scale, scale) + np.diag(floor)
     member = chosen.predict(scaled)
     reflections = np.array(
@@ -141,12 +134,13 @@ def _fit_points(
         np.int8,
     )
     tubes = joint_to_tubes(
-        np.log(np.maximum(chosen.weights_, 1e-12)),
+        np.log(np.maximum(chosen.weights_, fit.least_weight)),
         chosen.means_ * scale + points.mean(axis=0),
         cov,
         reflections,
+        position_floor=fit.position_floor,
     )
     # The floor of the length lies along the tube: the position moves with it.
     u_cov = tubes.u_cov.copy()
-    u_cov[:, 0] += LENGTH_FLOOR**2
+    u_cov[:, 0] += fit.length_floor**2
     return replace(tubes, u_cov=u_cov)

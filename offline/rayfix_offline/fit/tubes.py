@@ -1,6 +1,5 @@
 """``fit = "tubes"``: cells fitted by analytic moments of their ray pieces, then merged."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numba
@@ -8,32 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.fit.join_surfaces import join_groups
-from rayfix_offline.fit.moments import POSITION_FLOOR, blur, gather_groups, gathered_arrays, new_rows
+from rayfix_offline.fit.moments import blur, gather_groups, gathered_arrays, new_rows
 from rayfix_offline.fit.runnalls import merge_runnalls
+from rayfix_offline.fit.settings import TubeFit
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_tables.mixture import TubeMixture, pack, widening_cov
-
-
-@dataclass(frozen=True, kw_only=True)
-class TubeFit:
-    """Settings of the fit.
-
-    Attributes
-    ----------
-    dropped_mass : float
-        Share of a cell's mass that may go with its lightest groups.
-    max_groups : int
-        Heaviest groups of a cell that are looked at.
-    max_components : int
-        Most components of a cell.
-    max_divergence : float
-        Divergence that a merge may cost, nats.
-    """
-
-    dropped_mass: float = 1e-5
-    max_groups: int = 250
-    max_components: int = 48
-    max_divergence: float = 1e-2
 
 
 def fit_tubes(
@@ -59,6 +37,7 @@ def fit_tubes(
     counts, log_mass, log_weight, mean, cov, label = _fit_block(
         centres,
         level.window,
+        fit.cutoff,
         *gathered_arrays(level.rays, level.pieces, sequences),
         level.surface_sequences,
         bool(np.any(level.surface_sequences != np.arange(len(sequences.images)))),
@@ -68,9 +47,12 @@ def fit_tubes(
         fit.max_groups,
         fit.max_components,
         fit.max_divergence,
+        fit.length_floor,
+        fit.position_floor,
         new_rows(len(sequences.images)),
     )
-    return counts, log_mass, joint_to_tubes(log_weight, mean, cov, sequences.num_reflections[label])
+    mixture = joint_to_tubes(log_weight, mean, cov, sequences.num_reflections[label], position_floor=fit.position_floor)
+    return counts, log_mass, mixture
 
 
 def joint_to_tubes(
@@ -78,6 +60,8 @@ def joint_to_tubes(
     mean: NDArray[np.float64],
     cov: NDArray[np.float64],
     num_reflections: NDArray[np.int8],
+    *,
+    position_floor: float,
 ) -> TubeMixture:
     """Turn joint moments of (u, x) into the table's form, u and x given u.
 
@@ -85,13 +69,15 @@ def joint_to_tubes(
     ----------
     mean : ndarray of shape (n, 6)
     cov : ndarray of shape (n, 6, 6)
+    position_floor : float, m
+        Smallest standard deviation of the position given u.
     """
     u_cov = cov[:, :3, :3]
     jacobian = np.swapaxes(np.linalg.solve(u_cov, cov[:, :3, 3:]), 1, 2) if len(mean) else np.zeros((0, 3, 3))
     x_cov = cov[:, 3:, 3:] - jacobian @ cov[:, :3, 3:] - widening_cov(mean[:, :3], u_cov, jacobian)
     # Of components that are not quite one tube, the widening that one would have may be more than there is.
     spread, axes = np.linalg.eigh(x_cov)
-    spread = np.maximum(spread, POSITION_FLOOR**2)
+    spread = np.maximum(spread, position_floor**2)
     x_cov = (axes * spread[:, None, :]) @ axes.transpose(0, 2, 1)
     return TubeMixture(
         log_weight=log_weight,
@@ -108,6 +94,7 @@ def joint_to_tubes(
 def _fit_block(
     centres: Any,
     window: Any,
+    cutoff: Any,
     ring_offsets: Any,
     ring_cells: Any,
     azimuth: Any,
@@ -130,6 +117,8 @@ def _fit_block(
     max_groups: Any,
     max_components: Any,
     max_divergence: Any,
+    length_floor: Any,
+    position_floor: Any,
     rows: Any,
 ) -> Any:
     num_cells = len(centres)
@@ -145,6 +134,7 @@ def _fit_block(
             centres[cell, 0],
             centres[cell, 1],
             window,
+            cutoff,
             ring_offsets,
             ring_cells,
             azimuth,
@@ -190,6 +180,8 @@ def _fit_block(
                 centres[cell, 0],
                 centres[cell, 1],
                 ray_spacing,
+                length_floor,
+                position_floor,
             )
         alive = merge_runnalls(weight, part_mean, part_cov, part_label, max_components, max_divergence)
         log_mass[cell] = np.log(whole)

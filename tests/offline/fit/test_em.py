@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rayfix_offline.fit.em import ExpectationMaximisation, fit_em, sample_points
-from rayfix_offline.fit.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.fit.em import fit_em, sample_points
+from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit, TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_offline.site import parse_site
 from rayfix_tables.angles import direction
@@ -35,7 +35,7 @@ def moments_of_pieces(level: LevelRays, cell: int) -> tuple[NDArray[np.float64],
     turn = rays.azimuth - centre[0]
     turn -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
     square = ((np.sin(centre[1]) * turn) ** 2 + (rays.zenith - centre[1]) ** 2) / level.window**2
-    window = np.where(square <= CUTOFF**2, np.exp(-square / 2.0), 0.0) / (2.0 * np.pi * level.window**2)
+    window = np.where(square <= RayFit.cutoff**2, np.exp(-square / 2.0), 0.0) / (2.0 * np.pi * level.window**2)
     weight = (window * rays.solid_angle)[ray] * pieces.mass
     heading = np.einsum("nij,nj->ni", sequences.mirrors[pieces.sequence], rays.directions[ray])
     place = sequences.images[pieces.sequence] + pieces.mean[:, None] * heading
@@ -86,9 +86,9 @@ def test_the_fit_is_valid(level: LevelRays) -> None:
         error = 4.0 * points.std(axis=0) / np.sqrt(FEW.num_points)
         assert np.all(np.abs(found - points.mean(axis=0)) < error)
     u_cov, x_cov = unpack(mixture.u_cov).astype(float), unpack(mixture.x_cov).astype(float)
-    assert np.all(u_cov[:, 0, 0] >= 0.99 * LENGTH_FLOOR**2)
+    assert np.all(u_cov[:, 0, 0] >= 0.99 * RayFit.length_floor**2)
     assert np.linalg.eigvalsh(u_cov).min() > 0.0
-    assert np.linalg.eigvalsh(x_cov).min() > 0.9 * POSITION_FLOOR**2
+    assert np.linalg.eigvalsh(x_cov).min() > 0.9 * RayFit.position_floor**2
     assert set(mixture.num_reflections.tolist()) <= {0, 1}
 
 

@@ -11,6 +11,7 @@ from scipy.stats import norm
 
 from rayfix_offline.fit.cells import assemble_level, fit_cells
 from rayfix_offline.fit.normalise import balanced
+from rayfix_offline.fit.settings import TubeFit
 from rayfix_offline.site import parse_site
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
@@ -110,7 +111,7 @@ def room(
     folder = tmp_path_factory.mktemp("room")
     site = parse_site(site_document(propagation={"max_reflections": 2}, table={"windows_deg": [5.0]}))
     rays = finest_level(folder, scene_of_boxes(room=ROOM, cabinet=CABINET, table=TABLE), site)
-    level = assemble_level(rays.window, rays.grid, [fit_cells(np.arange(rays.grid.num_cells), rays, site)])
+    level = assemble_level(rays.window, rays.grid, [fit_cells(np.arange(rays.grid.num_cells), rays, TubeFit())])
     free = np.ones((40, 50, 30), bool)
     for low, high in (CABINET, TABLE):
         (x0, y0, z0), (x1, y1, z1) = (np.round(10.0 * np.array(corner)).astype(int) for corner in (low, high))

@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from rayfix_offline.fit.em import ExpectationMaximisation, fit_em, sample_points
-from rayfix_offline.fit.moments import CUTOFF, POSITION_FLOOR
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.fit.em import fit_em, sample_points
+from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit, TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_offline.site import parse_site
 from rayfix_tables.angles import direction, tangent
@@ -20,7 +20,7 @@ from tests.support.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_box
 
 Array = NDArray[np.float64]
 STATION = np.array([3.6, 0.4, 2.6])
-INSIDE = 1.0 - np.exp(-(CUTOFF**2) / 2.0)  # share of a cell's window within its cut-off
+INSIDE = 1.0 - np.exp(-(RayFit.cutoff**2) / 2.0)  # share of a cell's window within its cut-off
 
 
 @pytest.fixture(scope="module")
@@ -102,9 +102,9 @@ def test_the_mass_of_each_cell_is_its_integral(empty_level: LevelRays) -> None:
     level = empty_level
     cells = np.arange(1, level.grid.num_cells, 11)
     _, log_mass, _ = fit_tubes(level.grid.centres[cells], level, TubeFit())
-    nodes = np.linspace(-CUTOFF, CUTOFF, 121)
+    nodes = np.linspace(-RayFit.cutoff, RayFit.cutoff, 121)
     h, v = np.meshgrid(nodes, nodes, indexing="ij")
-    disc = h**2 + v**2 <= CUTOFF**2
+    disc = h**2 + v**2 <= RayFit.cutoff**2
     window = np.exp(-(h**2 + v**2) / 2.0)[disc] / (2.0 * np.pi) * (nodes[1] - nodes[0]) ** 2
     ratio = []
     for cell, found in zip(cells, log_mass, strict=True):
@@ -177,7 +177,7 @@ def test_mixtures_are_valid(cluttered_level: LevelRays, fitted: tuple[NDArray[np
     scale = np.sqrt(np.einsum("nii->ni", u_cov))
     assert np.linalg.eigvalsh(u_cov / (scale[:, :, None] * scale[:, None, :])).min() > 1e-6
     # Given the ray coordinates, at least the floor is left; single precision takes a part in 1e6 of the largest.
-    assert np.linalg.eigvalsh(x_cov).min() > 0.9 * POSITION_FLOOR**2
+    assert np.linalg.eigvalsh(x_cov).min() > 0.9 * RayFit.position_floor**2
     assert set(mixture.num_reflections.tolist()) == {0, 1, 2}
     assert all(np.isfinite(getattr(mixture, name)).all() for name in ("x_mean", "jacobian", "u_mean"))
 
@@ -196,7 +196,7 @@ def test_the_fit_keeps_the_moments_of_the_rays(
     for cell in range(10, len(cells), 100):
         at = tangent(rays.azimuth, rays.zenith, *level.grid.centres[cell])
         square = (at**2).sum(axis=1) / level.window**2
-        window = np.where(square <= CUTOFF**2, np.exp(-square / 2.0), 0.0) / (2.0 * np.pi * level.window**2)
+        window = np.where(square <= RayFit.cutoff**2, np.exp(-square / 2.0), 0.0) / (2.0 * np.pi * level.window**2)
         weight = (window * rays.solid_angle)[ray] * pieces.mass
         points = np.concatenate([pieces.mean[:, None], at[ray], place], axis=1)
         mean = weight @ points / weight.sum()
