@@ -143,7 +143,7 @@ def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: n
     em = ExpectationMaximisation(num_components=(16,))
     numbers = scattered_blocks(level.grid.num_cells, num_cells, rng)
     centres = level.grid.centres[numbers]
-    counts, _, _ = fit_tubes(centres, level, TubeFit())
+    counts, _, _, _ = fit_tubes(centres, level, TubeFit())
     tubes = median_seconds(lambda: fit_tubes(centres, level, TubeFit())) / len(numbers)
     some = rng.permutation(len(numbers))[:num_em_cells]
     slow = median_seconds(lambda: fit_em(centres[some], numbers[some], level, em)) / len(some)

@@ -142,7 +142,7 @@ def measure(level: LevelRays, cells: NDArray[np.int64], points: list[NDArray[np.
         groups.append(len(mass))
         kept.append(np.sort(mass)[::-1][: fit.max_groups].sum() / mass.sum())
     begin = time.process_time()
-    counts, _, mixture = fit_tubes(centres, level, fit)
+    counts, _, mixture, _ = fit_tubes(centres, level, fit)
     seconds = time.process_time() - begin
     ends = np.cumsum(counts)
     scores = np.array(

@@ -140,14 +140,14 @@ def score_block(setting: Setting, level: LevelRays, held_out: dict[Cell, NDArray
     centres = level.grid.centres[numbers]
     fit = setting.fit
     if isinstance(fit, TubeFit):
-        counts, _, mixture = fit_tubes(centres, level, fit)
+        counts, _, mixture, _ = fit_tubes(centres, level, fit)
         # A call has a fixed cost, which a build spreads over a block.
         fixed = processor_seconds(lambda: fit_tubes(centres[:0], level, fit))
         varying = processor_seconds(lambda: fit_tubes(centres, level, fit)) - fixed
         seconds = varying / len(numbers) + fixed / BLOCK_CELLS
     else:
         begin = time.thread_time()
-        counts, _, mixture = fit_em(centres, numbers, level, fit)
+        counts, _, mixture, _ = fit_em(centres, numbers, level, fit)
         seconds = (time.thread_time() - begin) / len(numbers)
     ends = np.cumsum(counts)
     scores = []

@@ -155,7 +155,7 @@ def direct_levels(finest: Level, direct: list[LevelRays]) -> tuple[tuple[Level, 
     for rays in direct:
         fit_tubes(rays.grid.centres[:1], rays, TubeFit())  # compiles
         begin = time.thread_time()
-        counts, log_mass, mixture = fit_tubes(rays.grid.centres, rays, TubeFit())
+        counts, log_mass, mixture, _ = fit_tubes(rays.grid.centres, rays, TubeFit())
         seconds.append((time.thread_time() - begin) / rays.grid.num_cells)
         levels.append(
             Level(
@@ -177,7 +177,7 @@ def choose_cells(rays: LevelRays, count: int, rng: np.random.Generator) -> NDArr
 def fitted_by_em(rays: LevelRays, cells: NDArray[np.int64]) -> Fitted:
     """Fit cells by em to rays at the wide window."""
     begin = time.thread_time()
-    counts, _, mixture = fit_em(rays.grid.centres[cells], cells, rays, ExpectationMaximisation(num_components=(16,)))
+    counts, _, mixture, _ = fit_em(rays.grid.centres[cells], cells, rays, ExpectationMaximisation(num_components=(16,)))
     ends = np.cumsum(counts)
     return Fitted(
         cells=[mixture[int(end - count) : int(end)] for count, end in zip(counts, ends, strict=True)],

@@ -49,6 +49,8 @@ class StationSummary:
         Finest cells that came from the former table.
     largest_change : float
         By how much of its mass the measure of a kept cell has changed at most; 0 in an exact table.
+    num_dropped_components : int
+        Components that were left out with their weight, because they had no positive definite covariance.
     """
 
     station_id: str
@@ -59,6 +61,7 @@ class StationSummary:
     num_kept_cells: int
     largest_change: float
     num_components: int
+    num_dropped_components: int
     num_bytes: int
     lost_ray_share: float
     coverage: tuple[float, ...]
@@ -170,14 +173,19 @@ def build_table(
         software_version=software_version(),
     )
     job.store.remove()
+    stations = tuple(_summary(plan.station.id, station) for plan, station in zip(plans, built, strict=True))
     return BuildSummary(
         path=table_path,
         table_id=table_id,
         seconds=time.perf_counter() - begin,
         num_bytes=table_path.stat().st_size,
         peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-        stations=tuple(_summary(plan.station.id, station) for plan, station in zip(plans, built, strict=True)),
-        warnings=(*(finding.message for finding in twin.findings), *_lost_ray_warnings(plans, contents, twin)),
+        stations=stations,
+        warnings=(
+            *(finding.message for finding in twin.findings),
+            *_lost_ray_warnings(plans, contents, twin),
+            *_dropped_warnings(stations),
+        ),
     )
 
 
@@ -227,6 +235,16 @@ def _lost_ray_warnings(plans: tuple[StationPlan, ...], contents: list[StationCon
             )
 
 
+def _dropped_warnings(stations: tuple[StationSummary, ...]) -> Iterator[str]:
+    for station in stations:
+        if station.num_dropped_components:
+            yield (
+                f"{station.num_dropped_components} components of station '{station.station_id}' have no positive "
+                "definite covariance and are left out with their weight; they are of paths of next to no probability: "
+                "lower path_prior_exponent if they matter"
+            )
+
+
 def _scene_content(twin: Twin) -> SceneContent:
     return SceneContent(
         vertices=twin.scene.vertices,
@@ -249,6 +267,7 @@ def _summary(station_id: str, built: BuiltStation) -> StationSummary:
         num_kept_cells=built.num_kept_cells,
         largest_change=content.update.largest_change if content.update else 0.0,
         num_components=sum(len(level.mixture) for level in content.levels),
+        num_dropped_components=built.num_dropped,
         num_bytes=sum(level.num_bytes for level in content.levels),
         lost_ray_share=content.lost_ray_share,
         coverage=content.coverage,

@@ -14,7 +14,7 @@ from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
 from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit
-from rayfix_offline.fit.tubes import joint_to_tubes
+from rayfix_offline.fit.tubes import Fitted, fitted_cells
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_tables.angles import tangent, wrap
 from rayfix_tables.mixture import TubeMixture
@@ -22,8 +22,8 @@ from rayfix_tables.mixture import TubeMixture
 
 def fit_em(
     centres: NDArray[np.float64], cells: NDArray[np.int64], level: LevelRays, fit: ExpectationMaximisation
-) -> tuple[NDArray[np.int64], NDArray[np.float64], TubeMixture]:
-    """Fit a block of cells; see :func:`rayfix_offline.fit.tubes.fit_tubes` for what comes back.
+) -> Fitted:
+    """Fit a block of cells.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def fit_em(
     cells : ndarray of int64, shape (n_cells,)
         Numbers of the cells, for their seeds.
     """
-    counts = np.zeros(len(cells), np.int64)
+    counts, dropped = np.zeros(len(cells), np.int64), np.zeros(len(cells), np.int64)
     log_mass = np.full(len(cells), -np.inf)
     parts = []
     with threadpool_limits(limits=1):
@@ -40,10 +40,10 @@ def fit_em(
             points, num_reflections, mass = sample_points(centre, level, fit.num_points, rng, cutoff=fit.cutoff)
             if not len(points):
                 continue
-            log_mass[n] = np.log(mass)
-            parts.append(_fit_points(points, num_reflections, fit, int(rng.integers(2**31))))
-            counts[n] = len(parts[-1])
-    return counts, log_mass, TubeMixture.concatenate(parts)
+            part = _fit_points(np.log(mass), points, num_reflections, fit, int(rng.integers(2**31)))
+            counts[n], log_mass[n], dropped[n] = part.counts[0], part.log_mass[0], part.dropped[0]
+            parts.append(part.mixture)
+    return Fitted(counts, log_mass, TubeMixture.concatenate(parts), dropped)
 
 
 def sample_points(
@@ -105,8 +105,13 @@ def sample_points(
 
 
 def _fit_points(
-    points: NDArray[np.float64], num_reflections: NDArray[np.int8], fit: ExpectationMaximisation, seed: int
-) -> TubeMixture:
+    log_mass: float,
+    points: NDArray[np.float64],
+    num_reflections: NDArray[np.int8],
+    fit: ExpectationMaximisation,
+    seed: int,
+) -> Fitted:
+    """Fit one cell of a mass."""
     scale = np.maximum(points.std(axis=0), fit.least_scale)
     scaled = (points - points.mean(axis=0)) / scale
     best: tuple[float, GaussianMixture] | None = None
@@ -133,7 +138,9 @@ def _fit_points(
         ],
         np.int8,
     )
-    tubes = joint_to_tubes(
+    found = fitted_cells(
+        np.array([len(chosen.weights_)]),
+        np.array([log_mass]),
         np.log(np.maximum(chosen.weights_, fit.least_weight)),
         chosen.means_ * scale + points.mean(axis=0),
         cov,
@@ -141,6 +148,6 @@ def _fit_points(
         position_floor=fit.position_floor,
     )
     # The floor of the length lies along the tube: the position moves with it.
-    u_cov = tubes.u_cov.copy()
+    u_cov = found.mixture.u_cov.copy()
     u_cov[:, 0] += fit.length_floor**2
-    return replace(tubes, u_cov=u_cov)
+    return found._replace(mixture=replace(found.mixture, u_cov=u_cov))

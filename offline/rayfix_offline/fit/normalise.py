@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from rayfix_offline.fit.settings import BalanceSettings
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.conditioning import LOG_2PI, condition_on_angle
+from rayfix_tables.gaussians.definite import cholesky_factors
 from rayfix_tables.gaussians.normal_points import normal_points
 from rayfix_tables.level import UNBALANCED, Level
 
@@ -129,7 +130,9 @@ def _places(level: Level, settings: BalanceSettings) -> _Places:
             cov,
         )
         weight[begin:end], mean[begin:end] = np.exp(log_evidence), at[:, :3]
-        root[begin:end] = np.linalg.cholesky(cov[:, :3, :3] + settings.thickness * np.eye(3))
+        root[begin:end], definite = cholesky_factors(cov[:, :3, :3] + settings.thickness * np.eye(3))
+        # A component without a covariance is at no place: it adds to none, and keeps its weight.
+        mean[begin:end][~definite] = np.nan
     return _Places(weight, mean, root)
 
 

@@ -1,6 +1,6 @@
 """``fit = "tubes"``: cells fitted by analytic moments of their ray pieces, then merged."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -11,27 +11,38 @@ from rayfix_offline.fit.moments import blur, gather_groups, gathered_arrays, new
 from rayfix_offline.fit.runnalls import merge_runnalls
 from rayfix_offline.fit.settings import TubeFit
 from rayfix_offline.rays.trace import LevelRays
+from rayfix_tables.gaussians.definite import is_definite
 from rayfix_tables.mixture import TubeMixture, pack, widening_cov
 
 
-def fit_tubes(
-    centres: NDArray[np.float64], level: LevelRays, fit: TubeFit
-) -> tuple[NDArray[np.int64], NDArray[np.float64], TubeMixture]:
-    """Fit a block of cells.
+class Fitted(NamedTuple):
+    """Mixtures of a block of cells.
 
-    Parameters
+    Attributes
     ----------
-    centres : ndarray of shape (n_cells, 2), rad
-        Azimuths and zeniths.
-
-    Returns
-    -------
     counts : ndarray of int64, shape (n_cells,)
         Components of each cell.
     log_mass : ndarray of shape (n_cells,)
         Natural logarithm of each cell's mass; -inf where no ray comes.
     mixture : TubeMixture
         Components of all cells.
+    dropped : ndarray of int64, shape (n_cells,)
+        Components of each cell that were dropped with their weight, because they had no positive definite covariance.
+    """
+
+    counts: NDArray[np.int64]
+    log_mass: NDArray[np.float64]
+    mixture: TubeMixture
+    dropped: NDArray[np.int64]
+
+
+def fit_tubes(centres: NDArray[np.float64], level: LevelRays, fit: TubeFit) -> Fitted:
+    """Fit a block of cells.
+
+    Parameters
+    ----------
+    centres : ndarray of shape (n_cells, 2), rad
+        Azimuths and zeniths.
     """
     sequences = level.sequences
     counts, log_mass, log_weight, mean, cov, label = _fit_block(
@@ -51,8 +62,50 @@ def fit_tubes(
         fit.position_floor,
         new_rows(len(sequences.images)),
     )
-    mixture = joint_to_tubes(log_weight, mean, cov, sequences.num_reflections[label], position_floor=fit.position_floor)
-    return counts, log_mass, mixture
+    return fitted_cells(
+        counts, log_mass, log_weight, mean, cov, sequences.num_reflections[label], position_floor=fit.position_floor
+    )
+
+
+def fitted_cells(
+    counts: NDArray[np.int64],
+    log_mass: NDArray[np.float64],
+    log_weight: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    cov: NDArray[np.float64],
+    num_reflections: NDArray[np.int8],
+    *,
+    position_floor: float,
+) -> Fitted:
+    """Turn the joint moments of the components of cells into mixtures.
+
+    Components without a positive definite covariance are dropped with their weight, which the cell's mass loses; the
+    weights that are left add up to 1 again. Rounding can make such components of masses next to the smallest number.
+
+    Parameters
+    ----------
+    counts, log_mass
+        As in :class:`Fitted`, before components are dropped.
+    log_weight : ndarray of shape (n,)
+    mean, cov, num_reflections, position_floor
+        As in :func:`joint_to_tubes`.
+    """
+    proper = np.isfinite(mean).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)) & (mean[:, 0] > 0.0)
+    proper[proper] = is_definite(cov[proper, :3, :3])
+    dropped = np.zeros(len(counts), np.int64)
+    if not proper.all():
+        cell = np.repeat(np.arange(len(counts)), counts)
+        weight = np.exp(log_weight)
+        left, whole = (np.bincount(cell, w, len(counts)) for w in (np.where(proper, weight, 0.0), weight))
+        proper &= left[cell] > 0.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_left = np.where(whole > 0.0, np.log(left) - np.log(whole), 0.0)
+        dropped = np.bincount(cell[~proper], minlength=len(counts))
+        counts, log_mass = counts - dropped, log_mass + log_left
+        log_weight = (log_weight - log_left[cell])[proper]
+        mean, cov, num_reflections = mean[proper], cov[proper], num_reflections[proper]
+    mixture = joint_to_tubes(log_weight, mean, cov, num_reflections, position_floor=position_floor)
+    return Fitted(counts, log_mass, mixture, dropped)
 
 
 def joint_to_tubes(
@@ -69,6 +122,7 @@ def joint_to_tubes(
     ----------
     mean : ndarray of shape (n, 6)
     cov : ndarray of shape (n, 6, 6)
+        Positive definite; so are the covariances of the mixture.
     position_floor : float, m
         Smallest standard deviation of the position given u.
     """

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.fit.moments import SIZE
 from rayfix_offline.fit.settings import CoarseFit
-from rayfix_offline.fit.tubes import joint_to_tubes
+from rayfix_offline.fit.tubes import fitted_cells
 from rayfix_tables.gaussians.tree_reduction import halve_and_merge
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture
@@ -38,12 +38,15 @@ class SummedCells:
         Bound on the change of each cell's measure, as a share of its mass.
     mixture : TubeMixture
         Components of all cells.
+    dropped : ndarray of int64, shape (n_cells,)
+        As in :class:`~rayfix_offline.fit.tubes.Fitted`.
     """
 
     counts: NDArray[np.int64]
     log_mass: NDArray[np.float64]
     change: NDArray[np.float64]
     mixture: TubeMixture
+    dropped: NDArray[np.int64]
 
 
 def sum_cells(
@@ -65,12 +68,12 @@ def sum_cells(
     noise = np.array([fit.range_stdev**2, angle**2, angle**2, 0.0, 0.0, 0.0])
     # A change is a share of the mass as it would be, and what is summed are masses as they are.
     of_present = finer_change / np.maximum(1.0 - finer_change, 0.5)
-    counts = np.zeros(len(centres), np.int64)
+    counts, dropped = np.zeros(len(centres), np.int64), np.zeros(len(centres), np.int64)
     log_mass, change = np.empty(len(centres)), np.empty(len(centres))
     mixture = finer.mixture
     parts = []
     for n, (azimuth, zenith) in enumerate(centres):
-        log_mass[n], change[n], weight, mean, cov, num_reflections = _sum_cell(
+        whole, change[n], weight, mean, cov, num_reflections = _sum_cell(
             azimuth,
             zenith,
             window,
@@ -94,13 +97,23 @@ def sum_cells(
             fit.length_stretch,
             fit.least_length,
         )
-        counts[n] = len(weight)
-        parts.append(joint_to_tubes(np.log(weight), mean, cov, num_reflections, position_floor=fit.position_floor))
+        summed = fitted_cells(
+            np.array([len(weight)]),
+            np.array([whole]),
+            np.log(weight),
+            mean,
+            cov,
+            num_reflections,
+            position_floor=fit.position_floor,
+        )
+        counts[n], log_mass[n], dropped[n] = summed.counts[0], summed.log_mass[0], summed.dropped[0]
+        parts.append(summed.mixture)
     return SummedCells(
         counts=counts,
         log_mass=log_mass,
         change=change / np.maximum(1.0 - change, 0.5),
         mixture=TubeMixture.concatenate(parts),
+        dropped=dropped,
     )
 
 

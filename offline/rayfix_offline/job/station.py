@@ -66,11 +66,14 @@ class BuiltStation:
         Fitted now; some blocks from shards; some cells from a former table; all of it from there.
     num_kept_cells : int
         Cells of the finest level taken from the former table.
+    num_dropped : int
+        Components that were dropped, because they had no positive definite covariance; 0 for a part that was kept.
     """
 
     content: StationContent
     origin: str
     num_kept_cells: int
+    num_dropped: int
 
 
 def keep_station(plan: StationPlan, job: Job) -> BuiltStation | None:
@@ -78,7 +81,7 @@ def keep_station(plan: StationPlan, job: Job) -> BuiltStation | None:
     part = job.former.whole_part(plan, job.tolerance) if job.former else None
     if part is None:
         return None
-    return BuiltStation(content=_content_of(part), origin="kept", num_kept_cells=plan.num_finest_cells)
+    return BuiltStation(content=_content_of(part), origin="kept", num_kept_cells=plan.num_finest_cells, num_dropped=0)
 
 
 def build_station(plan: StationPlan, job: Job, remote: "Cluster | None", report: StationProgress) -> BuiltStation:
@@ -141,6 +144,7 @@ def build_station(plan: StationPlan, job: Job, remote: "Cluster | None", report:
         content=_assemble(plan, job, former, levels, launch),
         origin="updated" if num_kept else "resumed" if resumed else "built",
         num_kept_cells=num_kept,
+        num_dropped=sum(int(fitted.dropped.sum()) for fitted in parts.values()),
     )
 
 

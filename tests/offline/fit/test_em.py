@@ -70,10 +70,10 @@ def test_points_are_where_their_ray_coordinates_say(level: LevelRays) -> None:
 
 
 def test_the_fit_is_valid(level: LevelRays) -> None:
-    counts, log_mass, mixture = fit_em(level.grid.centres[CELLS], CELLS, level, FEW)
+    counts, log_mass, mixture, _ = fit_em(level.grid.centres[CELLS], CELLS, level, FEW)
     assert set(counts.tolist()) <= {2, 6}
     assert len(mixture) == counts.sum()
-    _, tubes_mass, _ = fit_tubes(level.grid.centres[CELLS], level, TubeFit())
+    _, tubes_mass, _, _ = fit_tubes(level.grid.centres[CELLS], level, TubeFit())
     np.testing.assert_allclose(log_mass, tubes_mass, rtol=0, atol=1e-12)
     ends = np.cumsum(counts)
     for cell, end, count in zip(CELLS, ends, counts, strict=True):
@@ -95,9 +95,9 @@ def test_the_fit_is_valid(level: LevelRays) -> None:
 def test_more_components_are_taken_where_they_pay(level: LevelRays) -> None:
     """BIC prefers six to one where rays are direct and mirrored, and one where that is all there is to choose."""
     centres = level.grid.centres[CELLS]
-    chosen, _, _ = fit_em(centres, CELLS, level, ExpectationMaximisation(num_points=1000, num_components=(1, 6)))
+    chosen, _, _, _ = fit_em(centres, CELLS, level, ExpectationMaximisation(num_points=1000, num_components=(1, 6)))
     assert chosen.tolist() == [6, 6, 6]
-    only, _, _ = fit_em(centres, CELLS, level, ExpectationMaximisation(num_points=1000, num_components=(1,)))
+    only, _, _, _ = fit_em(centres, CELLS, level, ExpectationMaximisation(num_points=1000, num_components=(1,)))
     assert only.tolist() == [1, 1, 1]
 
 

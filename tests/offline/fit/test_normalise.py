@@ -135,3 +135,15 @@ def test_shares_of_a_room_come_closer_to_one(room: tuple[Level, FreeSpace]) -> N
     low, high = (np.average(share[heard & walls], weights=volume[heard & walls]) for share in (before, after))
     assert low < 0.85
     assert low + 0.1 < high < 1.1
+
+
+def test_a_component_without_a_covariance_keeps_its_weight() -> None:
+    """Written by other software into a table, it made the whole normalisation fail with a LinAlgError."""
+    level = level_of(np.array([[4.0, 4.0, 4.0], [0.5, 4.0, 4.0]]), np.array([0.3, 0.3]), log_mass=3.0)
+    alone = level_of(np.array([[4.0, 4.0, 4.0]]), np.array([0.3]), log_mass=3.0 - np.log(2.0))
+    x_cov = level.mixture.x_cov.copy()
+    x_cov[1] = pack(-np.eye(3))
+    broken = replace(level, mixture=replace(level.mixture, x_cov=x_cov))
+    found = balanced(broken, open_space()).log_balance
+    assert found[1] == 0.0
+    assert found[0] == pytest.approx(balanced(alone, open_space()).log_balance[0], abs=1e-6)

@@ -88,7 +88,7 @@ def test_merging_costs_little_of_what_measurements_see(fine: tuple[LevelRays, Le
     wide = replace(rays, window=WIDE)
     angle = rays.window / WINDOW_RATIO
     variances = np.array([0.1**2, angle**2, angle**2, 0.0, 0.0, 0.0])
-    counts, _, wide_fit = fit_tubes(CENTRES, wide, TubeFit())
+    counts, _, wide_fit, _ = fit_tubes(CENTRES, wide, TubeFit())
     direct = np.split(np.arange(len(wide_fit)), np.cumsum(counts)[:-1])
     kept = wide_cells(level, CoarseFit(max_divergence=0.0))
     losses, gains = [], []

@@ -21,6 +21,7 @@ from rayfix_offline.twin.twin import Twin, prepare_twin
 FOLDERS = ("scene", "twin", "rays", "fit", "job")
 OF_TABLES = (
     "gaussians.conditioning",
+    "gaussians.definite",
     "gaussians.normal_points",
     "gaussians.tree_reduction",
     "level",
