@@ -24,15 +24,16 @@ from numpy.typing import NDArray
 from held_out import COMPONENT_BYTES
 from rayfix.example.files import write_example
 from rayfix_offline.fit.cells import assemble_level, fit_cells, widen_cells
-from rayfix_offline.fit.em import ExpectationMaximisation, fit_em
+from rayfix_offline.fit.em import fit_em
 from rayfix_offline.fit.moments import gather_groups, gathered_arrays, new_rows
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
-from rayfix_offline.rays import trace
+from rayfix_offline.fit.settings import CoarseFit, ExpectationMaximisation, RayFit, TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.rays.launch import launch
 from rayfix_offline.rays.pathprior import fill_path_prior
 from rayfix_offline.rays.pieces import cut_pieces
 from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments
+from rayfix_offline.rays.settings import RaySettings
 from rayfix_offline.rays.trace import LevelRays, StationTrace, level_grid, reflectivity_of, trace_station
 from rayfix_offline.scene.engine import RayEngine
 from rayfix_offline.site import SiteFile, read_site
@@ -84,7 +85,7 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
     reflected ones too, counts as a ray.
     """
     propagation = site.propagation
-    spacing = float(np.deg2rad(site.table.windows_deg[0])) / trace.RAYS_PER_WINDOW
+    spacing = float(np.deg2rad(site.table.windows_deg[0])) / RaySettings.rays_per_window
     exponent = propagation.path_prior_exponent
 
     def run_stage(engine: RayEngine = twin.engine) -> tuple[RaySet, Segments]:
@@ -109,7 +110,7 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
     bare = median_seconds(lambda: [scene.run(*query) for query in recorder.queries])
     del mesh
     stage = median_seconds(run_stage)
-    prior = fill_path_prior(rays, segments, twin.free_space, exponent=exponent, refinement=trace.PRIOR_REFINEMENT)
+    prior = fill_path_prior(rays, segments, twin.free_space, exponent=exponent, refinement=RaySettings.prior_refinement)
     print(
         f"rays: {len(rays)} with up to {propagation.max_reflections} reflections, {num_segments} segments\n"
         f"  ray stage          {num_segments / stage / 1e6:6.2f} million rays/s\n"
@@ -120,7 +121,7 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
         "rays": stage,
         "path prior": median_seconds(
             lambda: fill_path_prior(
-                rays, segments, twin.free_space, exponent=exponent, refinement=trace.PRIOR_REFINEMENT
+                rays, segments, twin.free_space, exponent=exponent, refinement=RaySettings.prior_refinement
             )
         ),
         "pieces": median_seconds(
@@ -130,7 +131,7 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
                 prior,
                 exponent=exponent,
                 kind=propagation.path_prior,
-                slice_ratio=trace.SLICE_RATIO,
+                slice_ratio=RaySettings.slice_ratio,
             )
         ),
     }
@@ -142,7 +143,7 @@ def measure_fits(traced: StationTrace, num_cells: int, num_em_cells: int, rng: n
     em = ExpectationMaximisation(num_components=(16,))
     numbers = scattered_blocks(level.grid.num_cells, num_cells, rng)
     centres = level.grid.centres[numbers]
-    counts, _, _ = fit_tubes(centres, level, TubeFit())
+    counts, _, _, _ = fit_tubes(centres, level, TubeFit())
     tubes = median_seconds(lambda: fit_tubes(centres, level, TubeFit())) / len(numbers)
     some = rng.permutation(len(numbers))[:num_em_cells]
     slow = median_seconds(lambda: fit_em(centres[some], numbers[some], level, em)) / len(some)
@@ -161,7 +162,7 @@ def measure_levels(traced: StationTrace, site: SiteFile, gather: float) -> dict[
     window = traced.finest.window
     begin = time.thread_time()
     parts = [
-        fit_cells(cells, traced.finest, site)
+        fit_cells(cells, traced.finest, TubeFit())
         for cells in np.array_split(np.arange(traced.finest.grid.num_cells), traced.finest.grid.num_cells // 256)
     ]
     finer = assemble_level(window, traced.finest.grid, parts)
@@ -170,9 +171,11 @@ def measure_levels(traced: StationTrace, site: SiteFile, gather: float) -> dict[
     print("sums of cells:")
     for window in np.deg2rad(site.table.windows_deg[1:]).tolist():
         grid = level_grid(window)
-        widen_cells(np.arange(1), window, grid, finer, np.zeros(finer.grid.num_cells, np.float32))
+        widen_cells(np.arange(1), window, grid, finer, np.zeros(finer.grid.num_cells, np.float32), CoarseFit())
         begin = time.thread_time()
-        wide = widen_cells(np.arange(grid.num_cells), window, grid, finer, np.zeros(finer.grid.num_cells, np.float32))
+        wide = widen_cells(
+            np.arange(grid.num_cells), window, grid, finer, np.zeros(finer.grid.num_cells, np.float32), CoarseFit()
+        )
         taken = time.thread_time() - begin
         name = f"{np.rad2deg(window):g} deg"
         seconds[f"{name}: sums of cells"] = taken
@@ -197,7 +200,7 @@ def gather_cells(centres: NDArray[np.float64], level: LevelRays) -> None:
     arrays = gathered_arrays(level.rays, level.pieces, level.sequences)
     num_slices, rows = level.pieces.num_slices, new_rows(len(level.sequences.images))
     for centre in centres:
-        gather_groups(*centre, level.window, *arrays, num_slices, rows)
+        gather_groups(*centre, level.window, RayFit.cutoff, *arrays, num_slices, rows)
 
 
 def print_stages(seconds: dict[str, float]) -> None:

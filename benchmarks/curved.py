@@ -20,7 +20,8 @@ from held_out import log_densities
 from rayfix_offline.fit.em import sample_points
 from rayfix_offline.fit.join_surfaces import join_groups
 from rayfix_offline.fit.moments import gather_groups, new_rows
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.fit.settings import TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.rays.trace import LevelRays, trace_station
 from rayfix_offline.site import SiteFile, parse_site
 from rayfix_offline.twin.twin import Twin, prepare_twin
@@ -131,7 +132,7 @@ def measure(level: LevelRays, cells: NDArray[np.int64], points: list[NDArray[np.
     groups, kept = [], []
     for centre in centres:
         seq, slices, mass, mean, cov = gather_groups(
-            *centre, level.window, rays.grid.ring_offsets, rays.grid.ring_cells, rays.azimuth, rays.zenith,
+            *centre, level.window, fit.cutoff, rays.grid.ring_offsets, rays.grid.ring_cells, rays.azimuth, rays.zenith,
             rays.solid_angle, rays.directions, pieces.offsets, pieces.sequence, pieces.slice, pieces.mass,
             pieces.mean, pieces.variance, sequences.images, sequences.mirrors, pieces.num_slices,
             new_rows(len(sequences.images)),
@@ -141,7 +142,7 @@ def measure(level: LevelRays, cells: NDArray[np.int64], points: list[NDArray[np.
         groups.append(len(mass))
         kept.append(np.sort(mass)[::-1][: fit.max_groups].sum() / mass.sum())
     begin = time.process_time()
-    counts, _, mixture = fit_tubes(centres, level, fit)
+    counts, _, mixture, _ = fit_tubes(centres, level, fit)
     seconds = time.process_time() - begin
     ends = np.cumsum(counts)
     scores = np.array(

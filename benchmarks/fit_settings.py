@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 
-from rayfix_offline.fit.em import ExpectationMaximisation
-from rayfix_offline.fit.tubes import TubeFit
-from rayfix_offline.rays import trace
+from rayfix_offline.fit.settings import ExpectationMaximisation, TubeFit
+from rayfix_offline.rays.settings import RaySettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +24,7 @@ class Setting:
     family: str
     fit: TubeFit | ExpectationMaximisation
     value: float = 0.0
-    slice_ratio: float = trace.SLICE_RATIO
+    slice_ratio: float = RaySettings.slice_ratio
     cells: str = "some"
 
 
@@ -54,7 +53,7 @@ CANDIDATES = (
 
 def default_of(family: str) -> float:
     """Value of a swept setting in the default fit."""
-    return trace.SLICE_RATIO if family == "slice_ratio" else float(getattr(DEFAULT.fit, family))
+    return RaySettings.slice_ratio if family == "slice_ratio" else float(getattr(DEFAULT.fit, family))
 
 
 def swept(family: str, value: float) -> Setting:

@@ -21,7 +21,8 @@ from fit_settings import SETTINGS, Setting
 from held_out import REFERENCE_RATIO, log_densities, processor_seconds, trace_sliced
 from rayfix.example.files import write_example
 from rayfix_offline.fit.em import fit_em, sample_points
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.fit.settings import TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.job.plan import BLOCK_CELLS
 from rayfix_offline.rays.trace import LevelRays, level_grid
 from rayfix_offline.site import SiteFile, read_site
@@ -139,14 +140,14 @@ def score_block(setting: Setting, level: LevelRays, held_out: dict[Cell, NDArray
     centres = level.grid.centres[numbers]
     fit = setting.fit
     if isinstance(fit, TubeFit):
-        counts, _, mixture = fit_tubes(centres, level, fit)
+        counts, _, mixture, _ = fit_tubes(centres, level, fit)
         # A call has a fixed cost, which a build spreads over a block.
         fixed = processor_seconds(lambda: fit_tubes(centres[:0], level, fit))
         varying = processor_seconds(lambda: fit_tubes(centres, level, fit)) - fixed
         seconds = varying / len(numbers) + fixed / BLOCK_CELLS
     else:
         begin = time.thread_time()
-        counts, _, mixture = fit_em(centres, numbers, level, fit)
+        counts, _, mixture, _ = fit_em(centres, numbers, level, fit)
         seconds = (time.thread_time() - begin) / len(numbers)
     ends = np.cumsum(counts)
     scores = []

@@ -1,15 +1,12 @@
 """Log-likelihood of points that a fit has not seen, and what else the studies of fits have in common."""
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any
-from unittest import mock
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.rays import trace
+from rayfix_offline.rays.settings import RaySettings
 from rayfix_offline.rays.trace import LevelRays, trace_station
 from rayfix_offline.site import SiteFile
 from rayfix_offline.twin.twin import Twin
@@ -23,18 +20,9 @@ COMPONENT_BYTES = sum(
 )
 
 
-@contextmanager
-def sliced(ratio: float) -> Iterator[None]:
-    """Cut rays into slices of this ratio until the block ends."""
-    other: Any = mock.patch.object(trace, "SLICE_RATIO", ratio)
-    with other:
-        yield
-
-
 def trace_sliced(station: int, site: SiteFile, twin: Twin, ratio: float) -> LevelRays:
     """Trace a station as a build does, but with slices of this ratio."""
-    with sliced(ratio):
-        return trace_station(site.stations[station], site, twin).finest
+    return trace_station(site.stations[station], site, twin, settings=RaySettings(slice_ratio=ratio)).finest
 
 
 def trace_window(station: int, site: SiteFile, twin: Twin, window_deg: float) -> LevelRays:

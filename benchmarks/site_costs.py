@@ -14,6 +14,8 @@ import trimesh
 
 from rayfix.example.hall import HALL_SIZE, hall_scene
 from rayfix_offline.fit.cells import assemble_level, fit_cells, widen_cells
+from rayfix_offline.fit.settings import CoarseFit
+from rayfix_offline.job.method import Method
 from rayfix_offline.job.plan import plan_build
 from rayfix_offline.rays.trace import level_grid, trace_station
 from rayfix_offline.site import SiteFile, read_site
@@ -76,7 +78,7 @@ def measure(site: SiteFile, folder: Path, options: argparse.Namespace) -> None:
         f"scene: {extent} m, {len(twin.scene.faces):,} triangles, {scene_bytes / 1e6:.1f} MB to each worker; free "
         f"space in voxels of {twin.free_space.voxel_size:.2f} m; prepared in {preparing:.1f} s"
     )
-    section = site.stations[0]
+    section, fit = site.stations[0], Method().fit(site)
     trace_station(section, site, twin)  # compiles
     begin = time.process_time()
     trace = trace_station(section, site, twin)
@@ -91,9 +93,11 @@ def measure(site: SiteFile, folder: Path, options: argparse.Namespace) -> None:
         for chosen in (cells[:2], cells):  # the first compiles
             begin = time.process_time()
             if finer is None:
-                fitted = fit_cells(chosen, trace.finest, site)
+                fitted = fit_cells(chosen, trace.finest, fit)
             else:
-                fitted = widen_cells(chosen, window, level_grid(window), finer, np.zeros(finer.num_cells, np.float32))
+                fitted = widen_cells(
+                    chosen, window, level_grid(window), finer, np.zeros(finer.num_cells, np.float32), CoarseFit()
+                )
             spent = time.process_time() - begin
         finer = assemble_level(window, level_grid(window), [fitted])
         seconds += spent

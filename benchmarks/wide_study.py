@@ -22,9 +22,10 @@ from held_out import COMPONENT_BYTES, REFERENCE_RATIO, log_density_as_measured, 
 from rayfix.example.files import write_example
 from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly, locate_drops
 from rayfix_evaluation.drops.simulate import Noise
-from rayfix_offline.fit.em import ExpectationMaximisation, fit_em, sample_points
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
-from rayfix_offline.fit.wide_windows import CoarseFit, sum_cells
+from rayfix_offline.fit.em import fit_em, sample_points
+from rayfix_offline.fit.settings import CoarseFit, ExpectationMaximisation, TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
+from rayfix_offline.fit.wide_windows import sum_cells
 from rayfix_offline.rays.trace import LevelRays, level_grid
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin.twin import prepare_twin
@@ -154,7 +155,7 @@ def direct_levels(finest: Level, direct: list[LevelRays]) -> tuple[tuple[Level, 
     for rays in direct:
         fit_tubes(rays.grid.centres[:1], rays, TubeFit())  # compiles
         begin = time.thread_time()
-        counts, log_mass, mixture = fit_tubes(rays.grid.centres, rays, TubeFit())
+        counts, log_mass, mixture, _ = fit_tubes(rays.grid.centres, rays, TubeFit())
         seconds.append((time.thread_time() - begin) / rays.grid.num_cells)
         levels.append(
             Level(
@@ -176,7 +177,7 @@ def choose_cells(rays: LevelRays, count: int, rng: np.random.Generator) -> NDArr
 def fitted_by_em(rays: LevelRays, cells: NDArray[np.int64]) -> Fitted:
     """Fit cells by em to rays at the wide window."""
     begin = time.thread_time()
-    counts, _, mixture = fit_em(rays.grid.centres[cells], cells, rays, ExpectationMaximisation(num_components=(16,)))
+    counts, _, mixture, _ = fit_em(rays.grid.centres[cells], cells, rays, ExpectationMaximisation(num_components=(16,)))
     ends = np.cumsum(counts)
     return Fitted(
         cells=[mixture[int(end - count) : int(end)] for count, end in zip(counts, ends, strict=True)],

@@ -16,12 +16,13 @@ import numpy as np
 from joblib import Parallel, delayed
 
 from rayfix_offline.fit.normalise import balanced
+from rayfix_offline.job.method import Method
 from rayfix_offline.job.plan import StationPlan, plan_build
 from rayfix_offline.job.previous_table import read_former
 from rayfix_offline.job.shards import ShardStore
 from rayfix_offline.job.station import BuiltStation, Job, StationProgress, build_station, keep_station
 from rayfix_offline.rays.lost_rays import LOST_RAYS_WARNING
-from rayfix_offline.site import SiteFile, read_site
+from rayfix_offline.site import read_site
 from rayfix_offline.twin.twin import Twin, prepare_twin, refuse_errors
 from rayfix_tables.errors import BuildError
 from rayfix_tables.version import software_version
@@ -48,6 +49,8 @@ class StationSummary:
         Finest cells that came from the former table.
     largest_change : float
         By how much of its mass the measure of a kept cell has changed at most; 0 in an exact table.
+    num_dropped_components : int
+        Components that were left out with their weight, because they had no positive definite covariance.
     """
 
     station_id: str
@@ -58,6 +61,7 @@ class StationSummary:
     num_kept_cells: int
     largest_change: float
     num_components: int
+    num_dropped_components: int
     num_bytes: int
     lost_ray_share: float
     coverage: tuple[float, ...]
@@ -129,15 +133,19 @@ def build_table(
     site = read_site(site_path)
     check_writable(table_path)
     report("reading the scene", 0, 0)
-    twin = prepare_twin(site, site_path.parent)
+    method = Method()
+    twin = prepare_twin(site, site_path.parent, method.twin)
     refuse_errors(twin)
-    plans = plan_build(site, twin)
+    plans = plan_build(site, twin, method)
     refused: list[str] = []
     former_table = read_former(
-        Path(former) if former is not None else table_path, required=former is not None, refused=refused.append
+        Path(former) if former is not None else table_path,
+        method,
+        required=former is not None,
+        refused=refused.append,
     )
     with closing(ShardStore.beside(table_path)) as store:
-        job = Job(site=site, twin=twin, store=store, jobs=jobs, former=former_table, tolerance=tolerance)
+        job = Job(site=site, twin=twin, method=method, store=store, jobs=jobs, former=former_table, tolerance=tolerance)
         built = _build_stations(plans, job, cluster, report)
         contents = [station.content for station in built]
         if not any(len(level.mixture) for content in contents for level in content.levels):
@@ -152,17 +160,19 @@ def build_table(
             software_version=software_version(),
         )
         store.remove()
+    stations = tuple(_summary(plan.station.id, station) for plan, station in zip(plans, built, strict=True))
     return BuildSummary(
         path=table_path,
         table_id=table_id,
         seconds=time.perf_counter() - begin,
         num_bytes=table_path.stat().st_size,
         peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-        stations=tuple(_summary(plan.station.id, station) for plan, station in zip(plans, built, strict=True)),
+        stations=stations,
         warnings=(
             *refused,
             *(finding.message for finding in twin.findings),
             *_lost_ray_warnings(plans, contents, twin),
+            *_dropped_warnings(stations),
         ),
     )
 
@@ -180,23 +190,24 @@ def _build_stations(
             station = keep_station(plan, job)
             if station is None:
                 if cluster is not None and remote is None:
-                    remote = stack.enter_context(_connect(cluster, job.site, job.twin))
+                    remote = stack.enter_context(_connect(cluster, job))
                 station = build_station(plan, job, remote, _after(done, total, report))
             built.append(station)
             done += plan.num_cells
     report("balancing", done, total)
-    return _balanced(built, job.site, job.twin, job.jobs)
+    return _balanced(built, job)
 
 
-def _balanced(stations: list[BuiltStation], site: SiteFile, twin: Twin, jobs: int) -> list[BuiltStation]:
+def _balanced(stations: list[BuiltStation], job: Job) -> list[BuiltStation]:
     """Balance all levels, if their prior makes the probabilities of the paths to a place add up to 1.
 
     A part that was kept whole is of the same free space, so that its balance holds.
     """
-    if site.propagation.path_prior != "power":
+    if job.site.propagation.path_prior != "power":
         return stations
     levels = [level for station in stations if not _keeps_balance(station) for level in station.content.levels]
-    done = iter(Parallel(n_jobs=jobs, prefer="threads")(delayed(balanced)(level, twin.free_space) for level in levels))
+    tasks = (delayed(balanced)(level, job.twin.free_space, job.method.balance) for level in levels)
+    done = iter(Parallel(n_jobs=job.jobs, prefer="threads")(tasks))
     return [
         station
         if _keeps_balance(station)
@@ -213,7 +224,7 @@ def _keeps_balance(station: BuiltStation) -> bool:
     return station.origin == "kept" and all(len(level.log_balance) == len(level.mixture) for level in levels)
 
 
-def _connect(address: str, site: SiteFile, twin: Twin) -> "Cluster":
+def _connect(address: str, job: Job) -> "Cluster":
     """Connect to a cluster; only this needs Dask."""
     try:
         from rayfix_offline.job.cluster import Cluster
@@ -221,7 +232,7 @@ def _connect(address: str, site: SiteFile, twin: Twin) -> "Cluster":
         raise BuildError(
             f"the module '{error.name}' is not installed; install it with: pip install 'rayfix[cluster]'"
         ) from error
-    return Cluster(address, site, twin.scene)
+    return Cluster(address, job.site, job.twin.scene, job.method)
 
 
 def _lost_ray_warnings(plans: tuple[StationPlan, ...], contents: list[StationContent], twin: Twin) -> Iterator[str]:
@@ -230,6 +241,16 @@ def _lost_ray_warnings(plans: tuple[StationPlan, ...], contents: list[StationCon
             yield (
                 f"{content.lost_ray_share:.1%} of the rays of station '{plan.station.id}' leave the closed scene; it "
                 "has holes: close them"
+            )
+
+
+def _dropped_warnings(stations: tuple[StationSummary, ...]) -> Iterator[str]:
+    for station in stations:
+        if station.num_dropped_components:
+            yield (
+                f"{station.num_dropped_components} components of station '{station.station_id}' have no positive "
+                "definite covariance and are left out with their weight; they are of paths of next to no probability: "
+                "lower path_prior_exponent if they matter"
             )
 
 
@@ -255,6 +276,7 @@ def _summary(station_id: str, built: BuiltStation) -> StationSummary:
         num_kept_cells=built.num_kept_cells,
         largest_change=content.update.largest_change if content.update else 0.0,
         num_components=sum(len(level.mixture) for level in content.levels),
+        num_dropped_components=built.num_dropped,
         num_bytes=sum(level.num_bytes for level in content.levels),
         lost_ray_share=content.lost_ray_share,
         coverage=content.coverage,

@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_tables.gaussians.definite import rounded_definite
+
 FIELD_SHAPES: dict[str, tuple[int, ...]] = {
     "log_weight": (),
     "u_mean": (3,),
@@ -127,11 +129,18 @@ class TubeMixture:
         return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)})
 
     def as_stored(self) -> "TubeMixture":
-        """Return the same mixture in the types of the table file."""
+        """Return the same mixture in the types of the table file.
+
+        Covariances that are positive definite remain so: :func:`~rayfix_tables.gaussians.definite.rounded_definite`.
+        """
+        arrays = {name: getattr(self, name) for name in FIELD_SHAPES}
+        for name in ("u_cov", "x_cov"):
+            if arrays[name].dtype != FIELD_DTYPES[name]:
+                arrays[name] = pack(rounded_definite(unpack(arrays[name])))
         return TubeMixture(
             **{
-                name: np.ascontiguousarray(getattr(self, name), dtype=FIELD_DTYPES[name]).reshape(-1, *shape)
-                for name, shape in FIELD_SHAPES.items()
+                name: np.ascontiguousarray(array, dtype=FIELD_DTYPES[name]).reshape(-1, *FIELD_SHAPES[name])
+                for name, array in arrays.items()
             }
         )
 

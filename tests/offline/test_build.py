@@ -11,9 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from numpy.typing import NDArray
 
 from rayfix_offline.build import build_table
-from rayfix_offline.rays.trace import level_grid
+from rayfix_offline.fit import cells
+from rayfix_offline.fit.settings import TubeFit
+from rayfix_offline.fit.tubes import Fitted, fit_tubes
+from rayfix_offline.rays.trace import LevelRays, level_grid
 from rayfix_tables.angles import direction, local_to_scene
 from rayfix_tables.errors import SceneError, SiteError, TableError
 from rayfix_tables.table import Table
@@ -92,6 +96,22 @@ def test_the_summary_says_what_is_in_the_table(site_path: Path, tmp_path: Path) 
         assert (part.lost_ray_share, part.coverage) == (level_of.lost_ray_share, level_of.coverage)
     arrays = sum(part.num_bytes for part in summary.stations)
     assert 0.5 * summary.num_bytes < arrays < summary.num_bytes
+
+
+def test_dropped_components_are_counted(site_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each cell of the finest level has a component that no covariance can be given."""
+
+    def fit(centres: NDArray[np.float64], level: LevelRays, settings: TubeFit) -> Fitted:
+        fitted = fit_tubes(centres, level, settings)
+        return fitted._replace(dropped=np.ones_like(fitted.counts))
+
+    monkeypatch.setattr(cells, "fit_tubes", fit)
+    summary = build_table(site_path, tmp_path / "t.h5", jobs=1)
+    counts = {s.station_id: s.num_dropped_components for s in summary.stations}
+    assert counts == {s.station_id: s.num_finest_cells for s in summary.stations}
+    for station_id, count in counts.items():
+        told = f"{count} components of station '{station_id}' have no positive definite covariance and are left out"
+        assert any(told in warning for warning in summary.warnings)
 
 
 def test_progress_counts_up_to_all_cells(site_path: Path, tmp_path: Path) -> None:

@@ -7,14 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.fit.em import ExpectationMaximisation, fit_em
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
-from rayfix_offline.fit.wide_windows import CoarseFit, sum_cells
+from rayfix_offline.fit.em import fit_em
+from rayfix_offline.fit.settings import CoarseFit, ExpectationMaximisation, TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
+from rayfix_offline.fit.wide_windows import sum_cells
 from rayfix_offline.rays.trace import LevelRays
-from rayfix_offline.site import SiteFile
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+
+_COLUMNS = ("cells", "counts", "log_mass", "change", "dropped")
+"""Fields of :class:`FittedCells` with a number for each cell."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +32,8 @@ class FittedCells:
     log_mass : ndarray of shape (n_cells,)
     change : ndarray of float32, shape (n_cells,)
         Bound on the change of the cell's measure since it was fitted, as a share of its mass; 0: fitted to this scene.
+    dropped : ndarray of int64, shape (n_cells,)
+        Components of each cell that were dropped, see :class:`~rayfix_offline.fit.tubes.Fitted`; 0 for one of a table.
     mixture : TubeMixture
         Components of all cells.
     """
@@ -37,6 +42,7 @@ class FittedCells:
     counts: NDArray[np.int64]
     log_mass: NDArray[np.float64]
     change: NDArray[np.float32]
+    dropped: NDArray[np.int64]
     mixture: TubeMixture
 
     @classmethod
@@ -48,6 +54,7 @@ class FittedCells:
             counts=counts,
             log_mass=level.cell_log_mass[cells],
             change=change.astype(np.float32),
+            dropped=np.zeros(len(cells), np.int64),
             mixture=level.mixture[_places(level.cell_offsets[cells], counts)],
         )
 
@@ -63,20 +70,20 @@ class FittedCells:
             counts=counts[order],
             log_mass=np.concatenate([self.log_mass, other.log_mass])[order],
             change=np.concatenate([self.change, other.change])[order],
+            dropped=np.concatenate([self.dropped, other.dropped])[order],
             mixture=mixture[_places(starts[order], counts[order])],
         )
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a shard."""
-        fields = {name: getattr(self.mixture, name) for name in FIELD_SHAPES}
-        return {"cells": self.cells, "counts": self.counts, "log_mass": self.log_mass, "change": self.change, **fields}
+        columns = {name: getattr(self, name) for name in _COLUMNS}
+        return columns | {name: getattr(self.mixture, name) for name in FIELD_SHAPES}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> "FittedCells":
         """Take up what :meth:`to_arrays` gave."""
         mixture = TubeMixture(**{name: arrays[name] for name in FIELD_SHAPES})
-        columns = {name: arrays[name] for name in ("cells", "counts", "log_mass", "change")}
-        return cls(**columns, mixture=mixture)
+        return cls(**{name: arrays[name] for name in _COLUMNS}, mixture=mixture)
 
 
 def _places(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -85,27 +92,32 @@ def _places(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.
     return np.repeat(starts - (ends - counts), counts) + np.arange(counts.sum())
 
 
-def fit_cells(cells: NDArray[np.int64], level: LevelRays, site: SiteFile) -> FittedCells:
-    """Fit cells of a level in the way that the site asks for."""
+def fit_cells(cells: NDArray[np.int64], level: LevelRays, fit: TubeFit | ExpectationMaximisation) -> FittedCells:
+    """Fit cells of a level to its rays."""
     centres = level.grid.centres[cells]
-    if site.table.fit == "em":
-        counts, log_mass, mixture = fit_em(centres, cells, level, ExpectationMaximisation(seed=site.table.seed))
+    if isinstance(fit, ExpectationMaximisation):
+        fitted = fit_em(centres, cells, level, fit)
     else:
-        counts, log_mass, mixture = fit_tubes(centres, level, TubeFit())
-    change = np.zeros(len(cells), np.float32)
-    return FittedCells(cells=cells, counts=counts, log_mass=log_mass, change=change, mixture=mixture)
+        fitted = fit_tubes(centres, level, fit)
+    return FittedCells(cells=cells, change=np.zeros(len(cells), np.float32), **fitted._asdict())
 
 
 def widen_cells(
-    cells: NDArray[np.int64], window: float, grid: AngularGrid, finer: Level, finer_change: NDArray[np.float32]
+    cells: NDArray[np.int64],
+    window: float,
+    grid: AngularGrid,
+    finer: Level,
+    finer_change: NDArray[np.float32],
+    fit: CoarseFit,
 ) -> FittedCells:
     """Make cells of a wide window [rad] from those of the next finer level; see :func:`sum_cells`."""
-    summed = sum_cells(grid.centres[cells], window, finer, finer_change, CoarseFit())
+    summed = sum_cells(grid.centres[cells], window, finer, finer_change, fit)
     return FittedCells(
         cells=cells,
         counts=summed.counts,
         log_mass=summed.log_mass,
         change=summed.change.astype(np.float32),
+        dropped=summed.dropped,
         mixture=summed.mixture,
     )
 

@@ -5,7 +5,7 @@ Points are drawn from a cell's weighted ray pieces and a full-covariance Gaussia
 """
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,36 +13,17 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
-from rayfix_offline.fit.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR
-from rayfix_offline.fit.tubes import joint_to_tubes
+from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit
+from rayfix_offline.fit.tubes import Fitted, fitted_cells
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_tables.angles import tangent, wrap
 from rayfix_tables.mixture import TubeMixture
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExpectationMaximisation:
-    """Settings of the fit.
-
-    Attributes
-    ----------
-    num_points : int
-        Points drawn for a cell.
-    num_components : tuple of int
-        Numbers of components among which BIC chooses.
-    seed : int
-        Each cell draws with the seed (seed, cell).
-    """
-
-    num_points: int = 3000
-    num_components: tuple[int, ...] = (4, 8, 16)
-    seed: int = 1
-
-
 def fit_em(
     centres: NDArray[np.float64], cells: NDArray[np.int64], level: LevelRays, fit: ExpectationMaximisation
-) -> tuple[NDArray[np.int64], NDArray[np.float64], TubeMixture]:
-    """Fit a block of cells; see :func:`rayfix_offline.fit.tubes.fit_tubes` for what comes back.
+) -> Fitted:
+    """Fit a block of cells.
 
     Parameters
     ----------
@@ -50,25 +31,35 @@ def fit_em(
     cells : ndarray of int64, shape (n_cells,)
         Numbers of the cells, for their seeds.
     """
-    counts = np.zeros(len(cells), np.int64)
+    counts, dropped = np.zeros(len(cells), np.int64), np.zeros(len(cells), np.int64)
     log_mass = np.full(len(cells), -np.inf)
     parts = []
     with threadpool_limits(limits=1):
         for n, (centre, cell) in enumerate(zip(centres, cells, strict=True)):
             rng = np.random.default_rng([fit.seed, int(cell)])
-            points, num_reflections, mass = sample_points(centre, level, fit.num_points, rng)
+            points, num_reflections, mass = sample_points(centre, level, fit.num_points, rng, cutoff=fit.cutoff)
             if not len(points):
                 continue
-            log_mass[n] = np.log(mass)
-            parts.append(_fit_points(points, num_reflections, fit, int(rng.integers(2**31))))
-            counts[n] = len(parts[-1])
-    return counts, log_mass, TubeMixture.concatenate(parts)
+            part = _fit_points(np.log(mass), points, num_reflections, fit, int(rng.integers(2**31)))
+            counts[n], log_mass[n], dropped[n] = part.counts[0], part.log_mass[0], part.dropped[0]
+            parts.append(part.mixture)
+    return Fitted(counts, log_mass, TubeMixture.concatenate(parts), dropped)
 
 
 def sample_points(
-    centre: NDArray[np.float64], level: LevelRays, count: int, rng: np.random.Generator
+    centre: NDArray[np.float64],
+    level: LevelRays,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    cutoff: float = RayFit.cutoff,
 ) -> tuple[NDArray[np.float64], NDArray[np.int8], float]:
     """Draw points from the measure of a cell.
+
+    Parameters
+    ----------
+    cutoff : float
+        Rays are gathered within this many standard deviations of the window.
 
     Returns
     -------
@@ -79,14 +70,14 @@ def sample_points(
         The cell's mass.
     """
     rays, pieces, sequences = level.rays, level.pieces, level.sequences
-    reach = CUTOFF * level.window
+    reach = cutoff * level.window
     near = np.flatnonzero(
         (np.abs(rays.zenith - centre[1]) <= reach)
         & (np.abs(wrap(rays.azimuth - centre[0])) * np.sin(centre[1]) <= reach)
     )
     offset = tangent(rays.azimuth[near], rays.zenith[near], centre[0], centre[1])
     square = np.einsum("ij,ij->i", offset, offset) / level.window**2
-    inside = square <= CUTOFF**2
+    inside = square <= cutoff**2
     near, offset, square = near[inside], offset[inside], square[inside]
     density = np.exp(-0.5 * square) / (2.0 * np.pi * level.window**2) * rays.solid_angle[near]
     chosen = pieces.of_rays(near)
@@ -114,15 +105,22 @@ def sample_points(
 
 
 def _fit_points(
-    points: NDArray[np.float64], num_reflections: NDArray[np.int8], fit: ExpectationMaximisation, seed: int
-) -> TubeMixture:
-    scale = np.maximum(points.std(axis=0), 1e-6)
+    log_mass: float,
+    points: NDArray[np.float64],
+    num_reflections: NDArray[np.int8],
+    fit: ExpectationMaximisation,
+    seed: int,
+) -> Fitted:
+    """Fit one cell of a mass."""
+    scale = np.maximum(points.std(axis=0), fit.least_scale)
     scaled = (points - points.mean(axis=0)) / scale
     best: tuple[float, GaussianMixture] | None = None
     for num_components in fit.num_components:
-        mixture = GaussianMixture(num_components, reg_covar=1e-6, random_state=seed, max_iter=200)
+        mixture = GaussianMixture(
+            num_components, reg_covar=fit.regularisation, random_state=seed, max_iter=fit.max_rounds
+        )
         with warnings.catch_warnings():
-            # A mixture that has not settled after 200 rounds is judged by its BIC like any other.
+            # A mixture that has not settled after the last round is judged by its BIC like any other.
             warnings.simplefilter("ignore", ConvergenceWarning)
             mixture.fit(scaled)
         bic = float(mixture.bic(scaled))
@@ -130,7 +128,7 @@ def _fit_points(
             best = (bic, mixture)
     assert best is not None
     chosen = best[1]
-    floor = np.array([0.0, 0.0, 0.0, POSITION_FLOOR, POSITION_FLOOR, POSITION_FLOOR]) ** 2
+    floor = np.array([0.0, 0.0, 0.0, fit.position_floor, fit.position_floor, fit.position_floor]) ** 2
     cov = chosen.covariances_ * np.outer(scale, scale) + np.diag(floor)
     member = chosen.predict(scaled)
     reflections = np.array(
@@ -140,13 +138,16 @@ def _fit_points(
         ],
         np.int8,
     )
-    tubes = joint_to_tubes(
-        np.log(np.maximum(chosen.weights_, 1e-12)),
+    found = fitted_cells(
+        np.array([len(chosen.weights_)]),
+        np.array([log_mass]),
+        np.log(np.maximum(chosen.weights_, fit.least_weight)),
         chosen.means_ * scale + points.mean(axis=0),
         cov,
         reflections,
+        position_floor=fit.position_floor,
     )
     # The floor of the length lies along the tube: the position moves with it.
-    u_cov = tubes.u_cov.copy()
-    u_cov[:, 0] += LENGTH_FLOOR**2
-    return replace(tubes, u_cov=u_cov)
+    u_cov = found.mixture.u_cov.copy()
+    u_cov[:, 0] += fit.length_floor**2
+    return found._replace(mixture=replace(found.mixture, u_cov=u_cov))

@@ -17,15 +17,6 @@ from rayfix_offline.rays.segments import Sequences
 SIZE = 6
 """Length of the joint vector."""
 
-CUTOFF = 3.0
-"""A cell gathers rays within this many standard deviations of its window."""
-
-POSITION_FLOOR = 0.002
-"""Standard deviation that every component has at least across its tube, m."""
-
-LENGTH_FLOOR = 0.05
-"""Standard deviation that every component has at least along its tube, m."""
-
 NUM_SUMS = 28
 """Sums of a group: 6 of mass (1, a, a a), 12 of mass x length (1, a, d, d a), 10 of mass x length^2 (1, d, d d)."""
 
@@ -68,6 +59,7 @@ def gather_groups(
     centre_azimuth: Any,
     centre_zenith: Any,
     window: Any,
+    cutoff: Any,
     ring_offsets: Any,
     ring_cells: Any,
     azimuth: Any,
@@ -94,6 +86,8 @@ def gather_groups(
     ----------
     window : float, rad
         Standard deviation of the cell's window.
+    cutoff : float
+        Rays are gathered within this many standard deviations.
     num_slices : int
         Slices are numbered below this.
     rows : ndarray of int32, shape (n_sequences,)
@@ -114,7 +108,7 @@ def gather_groups(
     slots = np.full((64, num_slices), -1, np.int32)
     num_rows = np.int64(0)
     sine = np.sin(centre_zenith)
-    reach = CUTOFF * window
+    reach = cutoff * window
     num_rings = len(ring_cells)
     first_ring = max(0, int((centre_zenith - reach) / np.pi * num_rings))
     last_ring = min(num_rings - 1, int((centre_zenith + reach) / np.pi * num_rings))
@@ -128,7 +122,7 @@ def gather_groups(
             horizontal = sine * turn
             vertical = zenith[ray] - centre_zenith
             square = (horizontal * horizontal + vertical * vertical) / (window * window)
-            if square > CUTOFF * CUTOFF:
+            if square > cutoff * cutoff:
                 continue
             density = np.exp(-0.5 * square) / (2.0 * np.pi * window * window) * solid_angle[ray]
             first, last = piece_offsets[ray], piece_offsets[ray + 1]
@@ -293,6 +287,8 @@ def blur(
     centre_azimuth: Any,
     centre_zenith: Any,
     ray_spacing: Any,
+    length_floor: Any,
+    position_floor: Any,
 ) -> None:
     """Give a group the width of its rays: each stands for a patch of directions, and nothing is exact to a millimetre.
 
@@ -304,6 +300,8 @@ def blur(
     mirror : ndarray of shape (3, 3)
         Of the group's reflection sequence.
     ray_spacing : float, rad
+    length_floor, position_floor : float, m
+        Standard deviations that are added along and across the tube.
     """
     sine = np.sin(centre_zenith)
     azimuth = centre_azimuth + mean[1] / sine
@@ -319,7 +317,7 @@ def blur(
     local[1, 2] = np.cos(zenith) * np.sin(azimuth) * mean[0]
     local[2, 2] = -np.sin(zenith) * mean[0]
     variances = (
-        LENGTH_FLOOR * LENGTH_FLOOR,
+        length_floor * length_floor,
         ray_spacing * ray_spacing / 12.0,
         ray_spacing * ray_spacing / 12.0,
     )
@@ -337,7 +335,7 @@ def blur(
                 cov[3 + i, 3 + j] += variances[k] * step_i * step_j
         cov[k, k] += variances[k]
     for i in range(3):
-        cov[3 + i, 3 + i] += POSITION_FLOOR * POSITION_FLOOR
+        cov[3 + i, 3 + i] += position_floor * position_floor
 
 
 @numba.njit(cache=True, nogil=True)

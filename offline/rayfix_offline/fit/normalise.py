@@ -19,24 +19,12 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_offline.fit.settings import BalanceSettings
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.conditioning import LOG_2PI, condition_on_angle
+from rayfix_tables.gaussians.definite import cholesky_factors
 from rayfix_tables.gaussians.normal_points import normal_points
-from rayfix_tables.level import UNBALANCED, WINDOW_RATIO, Level
-
-_ROUNDS = 3
-
-_MOST = 2.0
-"""Factor by which a round raises or lowers a place at most."""
-
-_SIDE = 0.2
-"""Side of the blocks, m, in which shares are counted, unless voxels are larger."""
-
-_NUM_POINTS = 64
-"""Points that stand for a component."""
-
-_THIN = 1e-6
-"""Added to the variances of a component, m2: rounding may have made it singular."""
+from rayfix_tables.level import UNBALANCED, Level
 
 _CHUNK = 2**16
 """Components that are conditioned at a time."""
@@ -44,7 +32,7 @@ _CHUNK = 2**16
 Array = NDArray[np.float64]
 
 
-def balanced(level: Level, free_space: FreeSpace) -> Level:
+def balanced(level: Level, free_space: FreeSpace, settings: BalanceSettings | None = None) -> Level:
     """Give a level its ``log_balance``.
 
     Parameters
@@ -52,17 +40,20 @@ def balanced(level: Level, free_space: FreeSpace) -> Level:
     level : Level
     free_space : FreeSpace
         Of the scene that the level was made for.
+    settings : BalanceSettings, optional
     """
+    settings = settings or BalanceSettings()
     if not len(level.mixture):
         return replace(level, log_balance=UNBALANCED)
-    places = _places(level)
-    points = np.array(normal_points(_NUM_POINTS))
-    blocks = _blocks(free_space)
+    places = _places(level, settings)
+    points = np.array(normal_points(settings.num_points))
+    blocks = _blocks(free_space, settings.block_size)
+    most = settings.max_factor
     weight = places.weight.copy()
     log_balance = np.zeros(len(weight))
-    for _ in range(_ROUNDS):
+    for _ in range(settings.rounds):
         share = _shares(weight, places, points, blocks)
-        ratio = np.where(share > 0.0, 1.0 / np.clip(share, 1.0 / _MOST, _MOST), 1.0)
+        ratio = np.where(share > 0.0, 1.0 / np.clip(share, 1.0 / most, most), 1.0)
         gain = np.empty(len(weight))
         _gather(places.mean, places.root, points, *blocks.voxels, ratio, gain)
         weight *= gain
@@ -110,13 +101,13 @@ class _Blocks(NamedTuple):
         return self.origin, self.voxel_size, self.free, self.side
 
 
-def _places(level: Level) -> _Places:
+def _places(level: Level, settings: BalanceSettings) -> _Places:
     """Condition all cells on the noise that the window is for, with the measurement in the middle of the cell.
 
     Times the cells' solid angles, that sums over the directions that may be measured.
     """
     window = level.window**2
-    noise = window / WINDOW_RATIO**2
+    noise = window / settings.window_ratio**2
     left = window - noise
     log_factor = np.repeat(np.log(level.grid.solid_angles), level.grid.ring_cells) + level.cell_log_mass
     log_factor += LOG_2PI + 2.0 * np.log(window) - np.log(left)
@@ -139,12 +130,14 @@ def _places(level: Level) -> _Places:
             cov,
         )
         weight[begin:end], mean[begin:end] = np.exp(log_evidence), at[:, :3]
-        root[begin:end] = np.linalg.cholesky(cov[:, :3, :3] + _THIN * np.eye(3))
+        root[begin:end], definite = cholesky_factors(cov[:, :3, :3] + settings.thickness * np.eye(3))
+        # A component without a covariance is at no place: it adds to none, and keeps its weight.
+        mean[begin:end][~definite] = np.nan
     return _Places(weight, mean, root)
 
 
-def _blocks(free_space: FreeSpace) -> _Blocks:
-    side = max(1, round(_SIDE / free_space.voxel_size))
+def _blocks(free_space: FreeSpace, size: float) -> _Blocks:
+    side = max(1, round(size / free_space.voxel_size))
     shape = -(-np.array(free_space.free.shape) // side)
     padded = np.zeros(shape * side)
     nx, ny, nz = free_space.free.shape

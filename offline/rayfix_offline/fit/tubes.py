@@ -1,64 +1,54 @@
 """``fit = "tubes"``: cells fitted by analytic moments of their ray pieces, then merged."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.fit.join_surfaces import join_groups
-from rayfix_offline.fit.moments import POSITION_FLOOR, blur, gather_groups, gathered_arrays, new_rows
+from rayfix_offline.fit.moments import blur, gather_groups, gathered_arrays, new_rows
 from rayfix_offline.fit.runnalls import merge_runnalls
+from rayfix_offline.fit.settings import TubeFit
 from rayfix_offline.rays.trace import LevelRays
+from rayfix_tables.gaussians.definite import is_definite
 from rayfix_tables.mixture import TubeMixture, pack, widening_cov
 
 
-@dataclass(frozen=True, kw_only=True)
-class TubeFit:
-    """Settings of the fit.
+class Fitted(NamedTuple):
+    """Mixtures of a block of cells.
 
     Attributes
     ----------
-    dropped_mass : float
-        Share of a cell's mass that may go with its lightest groups.
-    max_groups : int
-        Heaviest groups of a cell that are looked at.
-    max_components : int
-        Most components of a cell.
-    max_divergence : float
-        Divergence that a merge may cost, nats.
-    """
-
-    dropped_mass: float = 1e-5
-    max_groups: int = 250
-    max_components: int = 48
-    max_divergence: float = 1e-2
-
-
-def fit_tubes(
-    centres: NDArray[np.float64], level: LevelRays, fit: TubeFit
-) -> tuple[NDArray[np.int64], NDArray[np.float64], TubeMixture]:
-    """Fit a block of cells.
-
-    Parameters
-    ----------
-    centres : ndarray of shape (n_cells, 2), rad
-        Azimuths and zeniths.
-
-    Returns
-    -------
     counts : ndarray of int64, shape (n_cells,)
         Components of each cell.
     log_mass : ndarray of shape (n_cells,)
         Natural logarithm of each cell's mass; -inf where no ray comes.
     mixture : TubeMixture
         Components of all cells.
+    dropped : ndarray of int64, shape (n_cells,)
+        Components of each cell that were dropped with their weight, because they had no positive definite covariance.
+    """
+
+    counts: NDArray[np.int64]
+    log_mass: NDArray[np.float64]
+    mixture: TubeMixture
+    dropped: NDArray[np.int64]
+
+
+def fit_tubes(centres: NDArray[np.float64], level: LevelRays, fit: TubeFit) -> Fitted:
+    """Fit a block of cells.
+
+    Parameters
+    ----------
+    centres : ndarray of shape (n_cells, 2), rad
+        Azimuths and zeniths.
     """
     sequences = level.sequences
     counts, log_mass, log_weight, mean, cov, label = _fit_block(
         centres,
         level.window,
+        fit.cutoff,
         *gathered_arrays(level.rays, level.pieces, sequences),
         level.surface_sequences,
         bool(np.any(level.surface_sequences != np.arange(len(sequences.images)))),
@@ -68,9 +58,54 @@ def fit_tubes(
         fit.max_groups,
         fit.max_components,
         fit.max_divergence,
+        fit.length_floor,
+        fit.position_floor,
         new_rows(len(sequences.images)),
     )
-    return counts, log_mass, joint_to_tubes(log_weight, mean, cov, sequences.num_reflections[label])
+    return fitted_cells(
+        counts, log_mass, log_weight, mean, cov, sequences.num_reflections[label], position_floor=fit.position_floor
+    )
+
+
+def fitted_cells(
+    counts: NDArray[np.int64],
+    log_mass: NDArray[np.float64],
+    log_weight: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    cov: NDArray[np.float64],
+    num_reflections: NDArray[np.int8],
+    *,
+    position_floor: float,
+) -> Fitted:
+    """Turn the joint moments of the components of cells into mixtures.
+
+    Components without a positive definite covariance are dropped with their weight, which the cell's mass loses; the
+    weights that are left add up to 1 again. Rounding can make such components of masses next to the smallest number.
+
+    Parameters
+    ----------
+    counts, log_mass
+        As in :class:`Fitted`, before components are dropped.
+    log_weight : ndarray of shape (n,)
+    mean, cov, num_reflections, position_floor
+        As in :func:`joint_to_tubes`.
+    """
+    proper = np.isfinite(mean).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)) & (mean[:, 0] > 0.0)
+    proper[proper] = is_definite(cov[proper, :3, :3])
+    dropped = np.zeros(len(counts), np.int64)
+    if not proper.all():
+        cell = np.repeat(np.arange(len(counts)), counts)
+        weight = np.exp(log_weight)
+        left, whole = (np.bincount(cell, w, len(counts)) for w in (np.where(proper, weight, 0.0), weight))
+        proper &= left[cell] > 0.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_left = np.where(whole > 0.0, np.log(left) - np.log(whole), 0.0)
+        dropped = np.bincount(cell[~proper], minlength=len(counts))
+        counts, log_mass = counts - dropped, log_mass + log_left
+        log_weight = (log_weight - log_left[cell])[proper]
+        mean, cov, num_reflections = mean[proper], cov[proper], num_reflections[proper]
+    mixture = joint_to_tubes(log_weight, mean, cov, num_reflections, position_floor=position_floor)
+    return Fitted(counts, log_mass, mixture, dropped)
 
 
 def joint_to_tubes(
@@ -78,6 +113,8 @@ def joint_to_tubes(
     mean: NDArray[np.float64],
     cov: NDArray[np.float64],
     num_reflections: NDArray[np.int8],
+    *,
+    position_floor: float,
 ) -> TubeMixture:
     """Turn joint moments of (u, x) into the table's form, u and x given u.
 
@@ -85,13 +122,16 @@ def joint_to_tubes(
     ----------
     mean : ndarray of shape (n, 6)
     cov : ndarray of shape (n, 6, 6)
+        Positive definite; so are the covariances of the mixture.
+    position_floor : float, m
+        Smallest standard deviation of the position given u.
     """
     u_cov = cov[:, :3, :3]
     jacobian = np.swapaxes(np.linalg.solve(u_cov, cov[:, :3, 3:]), 1, 2) if len(mean) else np.zeros((0, 3, 3))
     x_cov = cov[:, 3:, 3:] - jacobian @ cov[:, :3, 3:] - widening_cov(mean[:, :3], u_cov, jacobian)
     # Of components that are not quite one tube, the widening that one would have may be more than there is.
     spread, axes = np.linalg.eigh(x_cov)
-    spread = np.maximum(spread, POSITION_FLOOR**2)
+    spread = np.maximum(spread, position_floor**2)
     x_cov = (axes * spread[:, None, :]) @ axes.transpose(0, 2, 1)
     return TubeMixture(
         log_weight=log_weight,
@@ -108,6 +148,7 @@ def joint_to_tubes(
 def _fit_block(
     centres: Any,
     window: Any,
+    cutoff: Any,
     ring_offsets: Any,
     ring_cells: Any,
     azimuth: Any,
@@ -130,6 +171,8 @@ def _fit_block(
     max_groups: Any,
     max_components: Any,
     max_divergence: Any,
+    length_floor: Any,
+    position_floor: Any,
     rows: Any,
 ) -> Any:
     num_cells = len(centres)
@@ -145,6 +188,7 @@ def _fit_block(
             centres[cell, 0],
             centres[cell, 1],
             window,
+            cutoff,
             ring_offsets,
             ring_cells,
             azimuth,
@@ -190,6 +234,8 @@ def _fit_block(
                 centres[cell, 0],
                 centres[cell, 1],
                 ray_spacing,
+                length_floor,
+                position_floor,
             )
         alive = merge_runnalls(weight, part_mean, part_cov, part_label, max_components, max_divergence)
         log_mass[cell] = np.log(whole)

@@ -17,32 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.fit.moments import SIZE
-from rayfix_offline.fit.tubes import joint_to_tubes
+from rayfix_offline.fit.settings import CoarseFit
+from rayfix_offline.fit.tubes import fitted_cells
 from rayfix_tables.gaussians.tree_reduction import halve_and_merge
-from rayfix_tables.level import WINDOW_RATIO, Level
+from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture
-
-
-@dataclass(frozen=True, kw_only=True)
-class CoarseFit:
-    """Settings of the sums.
-
-    Attributes
-    ----------
-    reach : float
-        Finer cells are summed within this many standard deviations.
-    max_divergence : float
-        Divergence that a merge may cost, nats, under the noise of measurements.
-    noise_share : float
-        That noise is this share of the least noise of angles for which the wide window is looked up.
-    range_stdev : float, m
-        And of path lengths this.
-    """
-
-    reach: float = 3.0
-    max_divergence: float = 1e-2
-    noise_share: float = 0.5
-    range_stdev: float = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,12 +38,15 @@ class SummedCells:
         Bound on the change of each cell's measure, as a share of its mass.
     mixture : TubeMixture
         Components of all cells.
+    dropped : ndarray of int64, shape (n_cells,)
+        As in :class:`~rayfix_offline.fit.tubes.Fitted`.
     """
 
     counts: NDArray[np.int64]
     log_mass: NDArray[np.float64]
     change: NDArray[np.float64]
     mixture: TubeMixture
+    dropped: NDArray[np.int64]
 
 
 def sum_cells(
@@ -82,16 +64,16 @@ def sum_cells(
         Bound on the change of each finer cell's measure, as a share of its mass.
     """
     # Less noise than this is served by the finer level itself.
-    angle = fit.noise_share * finer.window / WINDOW_RATIO
+    angle = fit.noise_share * finer.window / fit.window_ratio
     noise = np.array([fit.range_stdev**2, angle**2, angle**2, 0.0, 0.0, 0.0])
     # A change is a share of the mass as it would be, and what is summed are masses as they are.
     of_present = finer_change / np.maximum(1.0 - finer_change, 0.5)
-    counts = np.zeros(len(centres), np.int64)
+    counts, dropped = np.zeros(len(centres), np.int64), np.zeros(len(centres), np.int64)
     log_mass, change = np.empty(len(centres)), np.empty(len(centres))
     mixture = finer.mixture
     parts = []
     for n, (azimuth, zenith) in enumerate(centres):
-        log_mass[n], change[n], weight, mean, cov, num_reflections = _sum_cell(
+        whole, change[n], weight, mean, cov, num_reflections = _sum_cell(
             azimuth,
             zenith,
             window,
@@ -112,26 +94,38 @@ def sum_cells(
             noise,
             fit.reach,
             fit.max_divergence,
+            fit.length_stretch,
+            fit.least_length,
         )
-        counts[n] = len(weight)
-        parts.append(joint_to_tubes(np.log(weight), mean, cov, num_reflections))
+        summed = fitted_cells(
+            np.array([len(weight)]),
+            np.array([whole]),
+            np.log(weight),
+            mean,
+            cov,
+            num_reflections,
+            position_floor=fit.position_floor,
+        )
+        counts[n], log_mass[n], dropped[n] = summed.counts[0], summed.log_mass[0], summed.dropped[0]
+        parts.append(summed.mixture)
     return SummedCells(
         counts=counts,
         log_mass=log_mass,
         change=change / np.maximum(1.0 - change, 0.5),
         mixture=TubeMixture.concatenate(parts),
+        dropped=dropped,
     )
 
 
 @numba.njit(cache=True, nogil=True)
-def _scale(weight: Any, mean: Any, noise: Any) -> Any:
+def _scale(weight: Any, mean: Any, noise: Any, length_stretch: Any, least_length: Any) -> Any:
     """Lengths in the units of which boxes are halved: what the noise of an angle makes at the mean path length."""
     length = 0.0
     for i in range(len(weight)):
         length += weight[i] * mean[i, 0]
     angle = np.sqrt(noise[1])
-    scale = np.full(SIZE, max(length, 1e-3) * angle)
-    scale[0] *= 2.5  # tubes are straight along their length
+    scale = np.full(SIZE, max(length, least_length) * angle)
+    scale[0] *= length_stretch  # tubes are straight along their length
     scale[1] = angle
     scale[2] = angle
     return scale
@@ -188,6 +182,8 @@ def _sum_cell(
     noise: Any,
     reach: Any,
     max_divergence: Any,
+    length_stretch: Any,
+    least_length: Any,
 ) -> Any:
     """Sum the cells around a direction: log mass, change, weights, means, covariances and numbers of reflections."""
     num_rings = len(ring_cells)
@@ -248,7 +244,7 @@ def _sum_cell(
     weight /= weight.sum()
     # Of components that become one, the number of reflections of the heaviest stays.
     heaviest = weight.copy()
-    scale, one_group = _scale(weight, mean, noise), np.zeros(total, np.int64)
+    scale, one_group = _scale(weight, mean, noise, length_stretch, least_length), np.zeros(total, np.int64)
     into = halve_and_merge(weight, mean, cov, one_group, scale, noise, max_divergence)
     for n in range(total):
         if heaviest[n] > heaviest[into[n]]:

@@ -7,29 +7,50 @@ of its mass: a bound on the L1 distance of the two measures. Cells whose pieces 
 exactly 0, and their fit is the same to the last bit.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.fit.moments import CUTOFF, ring_span
+from rayfix_offline.fit.moments import ring_span
+from rayfix_offline.fit.settings import RayFit
 from rayfix_offline.rays.trace import LevelRays
-
-SAME_COURSE = 1e-6
-"""Reflection sequences whose mirror images and mirrors differ by less than this are the same, m and 1."""
 
 SMALLEST = float(np.finfo(np.float32).tiny)
 """Change of a cell that is not the same to the last bit, at least: 0 stands for an exact one."""
 
 
-def cell_changes(old: LevelRays, new: LevelRays) -> NDArray[np.float64]:
+@dataclass(frozen=True, kw_only=True)
+class ComparisonSettings:
+    """Settings of the comparison; part of the identity of every station's part of a table.
+
+    Attributes
+    ----------
+    same_course : float, m and 1
+        Reflection sequences whose mirror images and mirrors differ by no more than this are the same.
+    """
+
+    same_course: float = 1e-6
+
+
+def cell_changes(
+    old: LevelRays,
+    new: LevelRays,
+    *,
+    cutoff: float = RayFit.cutoff,
+    settings: ComparisonSettings | None = None,
+) -> NDArray[np.float64]:
     """Compare the cells of a level between two traces.
 
     Parameters
     ----------
     old, new : LevelRays
         Of the same station, window and seed, in two scenes.
+    cutoff : float
+        The fit gathers rays within this many standard deviations of the window.
+    settings : ComparisonSettings, optional
 
     Returns
     -------
@@ -39,12 +60,13 @@ def cell_changes(old: LevelRays, new: LevelRays) -> NDArray[np.float64]:
     """
     if not np.array_equal(old.rays.directions, new.rays.directions):
         return np.full(new.grid.num_cells, np.inf)
-    change, mass, same = ray_changes(old, new)
+    change, mass, same = ray_changes(old, new, settings)
     rays = new.rays
     return np.asarray(
         _sum_over_cells(
             new.grid.centres,
             new.window,
+            cutoff,
             rays.grid.ring_offsets,
             rays.grid.ring_cells,
             rays.azimuth,
@@ -57,7 +79,9 @@ def cell_changes(old: LevelRays, new: LevelRays) -> NDArray[np.float64]:
     )
 
 
-def ray_changes(old: LevelRays, new: LevelRays) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+def ray_changes(
+    old: LevelRays, new: LevelRays, settings: ComparisonSettings | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Compare rays piece by piece.
 
     Returns
@@ -89,6 +113,7 @@ def ray_changes(old: LevelRays, new: LevelRays) -> tuple[NDArray[np.float64], ND
         new.sequences.images,
         new.sequences.mirrors,
         new.surface_sequences,
+        (settings or ComparisonSettings()).same_course,
     )
     return change, mass, same
 
@@ -113,6 +138,7 @@ def _compare(
     images_b: Any,
     mirrors_b: Any,
     surfaces_b: Any,
+    same_course: Any,
 ) -> Any:
     num_rays = len(offsets_b) - 1
     change = np.zeros(num_rays)
@@ -147,7 +173,7 @@ def _compare(
                     if partner_a[whole_a] >= 0:
                         torn[partner_a[whole_a]] = True
             while i < end_i or j < end_j:
-                if apart <= SAME_COURSE and i < end_i and j < end_j and slice_a[i] == slice_b[j]:
+                if apart <= same_course and i < end_i and j < end_j and slice_a[i] == slice_b[j]:
                     change[ray] += abs(mass_a[i] - mass_b[j])
                     mass[ray] += mass_b[j]
                     moved = abs(mean_a[i] - mean_b[j])
@@ -191,6 +217,7 @@ def _distance(image_a: Any, mirror_a: Any, image_b: Any, mirror_b: Any) -> Any:
 def _sum_over_cells(
     centres: Any,
     window: Any,
+    cutoff: Any,
     ring_offsets: Any,
     ring_cells: Any,
     azimuth: Any,
@@ -202,7 +229,7 @@ def _sum_over_cells(
 ) -> Any:
     """Sum over the rays that a cell gathers; see :func:`rayfix_offline.fit.moments.gather_groups`."""
     result = np.zeros(len(centres))
-    reach = CUTOFF * window
+    reach = cutoff * window
     num_rings = len(ring_cells)
     for cell in range(len(centres)):
         centre_azimuth, centre_zenith = centres[cell]
@@ -220,7 +247,7 @@ def _sum_over_cells(
                 horizontal = sine * turn
                 vertical = zenith[ray] - centre_zenith
                 square = (horizontal * horizontal + vertical * vertical) / (window * window)
-                if square > CUTOFF * CUTOFF:
+                if square > cutoff * cutoff:
                     continue
                 density = np.exp(-0.5 * square) * solid_angle[ray]
                 changed += density * change[ray]

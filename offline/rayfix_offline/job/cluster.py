@@ -16,6 +16,7 @@ from distributed import Client, as_completed
 from numpy.typing import NDArray
 
 from rayfix_offline.fit.cells import FittedCells, fit_cells, widen_cells
+from rayfix_offline.job.method import Method
 from rayfix_offline.job.plan import BUILD_VERSION, Block, StationPlan
 from rayfix_offline.job.shards import content_key
 from rayfix_offline.rays.trace import StationTrace, level_grid, trace_station
@@ -34,6 +35,7 @@ RETRIES = 5
 TRACES_KEPT = 2
 """Stations whose rays a worker keeps in memory; blocks come station by station."""
 
+_Inputs = tuple[dict[str, Any], Scene, Method]
 _Task = tuple[Callable[..., dict[str, Any]], tuple[Any, ...]]
 
 _traces: "OrderedDict[str, StationTrace]" = OrderedDict()
@@ -54,7 +56,7 @@ class Cluster:
         When no scheduler answers, or it has no workers.
     """
 
-    def __init__(self, address: str, site: SiteFile, scene: Scene) -> None:
+    def __init__(self, address: str, site: SiteFile, scene: Scene, method: Method) -> None:
         try:
             self._client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -64,8 +66,8 @@ class Cluster:
         if not self._client.scheduler_info()["workers"]:
             self._client.close()
             raise BuildError(f"the Dask scheduler at {address} has no workers; start some with 'dask worker {address}'")
-        self._site, self._scene = site.model_dump(mode="json"), scene
-        self._inputs_id = content_key(self._site, scene.sha256)
+        self._inputs: _Inputs = (site.model_dump(mode="json"), scene, method)
+        self._inputs_id = content_key(self._inputs[0], scene.sha256, method.identity())
 
     def __enter__(self) -> "Cluster":
         """Return the connection."""
@@ -125,7 +127,7 @@ class Cluster:
     def _run(self, plan: StationPlan, tasks: Mapping[str, _Task]) -> Iterator[tuple[str, dict[str, Any]]]:
         """Run tasks on the workers."""
         # A task that hands the inputs on, and not data scattered to workers: Dask can repeat it when they are lost.
-        inputs = self._client.submit(_hand_on, self._site, self._scene, key=f"rayfix-inputs-{self._inputs_id}")
+        inputs = self._client.submit(_hand_on, *self._inputs, key=f"rayfix-inputs-{self._inputs_id}")
         futures = {
             self._client.submit(
                 run,
@@ -161,40 +163,41 @@ def _hand_on(*inputs: Any) -> tuple[Any, ...]:
     return inputs
 
 
-def _fit_remotely(
-    part: tuple[str, int, str], inputs: tuple[dict[str, Any], Scene], cells: NDArray[np.int64]
-) -> dict[str, Any]:
+def _fit_remotely(part: tuple[str, int, str], inputs: _Inputs, cells: NDArray[np.int64]) -> dict[str, Any]:
     """Fit a block on a worker."""
-    site = parse_site(inputs[0])
-    return fit_cells(cells, _trace(part, site, inputs[1]).finest, site).to_arrays()
+    site, scene, method = parse_site(inputs[0]), *inputs[1:]
+    return fit_cells(cells, _trace(part, site, scene, method).finest, method.fit(site)).to_arrays()
 
 
 def _widen_remotely(
     part: tuple[str, int, str],
-    inputs: tuple[dict[str, Any], Scene],
+    inputs: _Inputs,
     source: tuple[Level, NDArray[np.float32]],
     level: int,
     cells: NDArray[np.int64],
 ) -> dict[str, Any]:
     """Make a block of a wide level on a worker."""
     _check_version(part[1])
+    method = inputs[2]
     window = float(np.deg2rad(parse_site(inputs[0]).table.windows_deg[level]))
-    return widen_cells(cells, window, level_grid(window), *source).to_arrays()
+    grid = level_grid(window, cells_per_window=method.rays.cells_per_window)
+    return widen_cells(cells, window, grid, *source, method.wide).to_arrays()
 
 
-def _launch_remotely(part: tuple[str, int, str], inputs: tuple[dict[str, Any], Scene]) -> dict[str, Any]:
+def _launch_remotely(part: tuple[str, int, str], inputs: _Inputs) -> dict[str, Any]:
     """Trace a station's rays on a worker."""
-    return _trace(part, parse_site(inputs[0]), inputs[1]).to_arrays()
+    return _trace(part, parse_site(inputs[0]), *inputs[1:]).to_arrays()
 
 
-def _trace(part: tuple[str, int, str], site: SiteFile, scene: Scene) -> StationTrace:
+def _trace(part: tuple[str, int, str], site: SiteFile, scene: Scene, method: Method) -> StationTrace:
     """Rays of a station, traced once on each worker."""
     part_id, version, station_id = part
     _check_version(version)
     with _lock:
         if part_id not in _traces:
             (section,) = [s for s in site.stations if s.id == station_id]
-            _traces[part_id] = trace_station(section, site, prepare_scene(site, scene))
+            twin = prepare_scene(site, scene, method.twin)
+            _traces[part_id] = trace_station(section, site, twin, settings=method.rays, reflection=method.reflection)
             while len(_traces) > TRACES_KEPT:
                 _traces.popitem(last=False)
         return _traces[part_id]

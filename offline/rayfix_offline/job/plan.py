@@ -1,28 +1,22 @@
 """What a build has to do: the cells of each station in blocks, each part named by all that decides its content."""
 
-import dataclasses
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.fit import moments
-from rayfix_offline.fit.em import ExpectationMaximisation
-from rayfix_offline.fit.tubes import TubeFit
-from rayfix_offline.fit.wide_windows import CoarseFit
+from rayfix_offline.job.method import Method
 from rayfix_offline.job.shards import content_key
-from rayfix_offline.rays import trace
 from rayfix_offline.rays.trace import level_grid
 from rayfix_offline.site import SiteFile, StationSection
-from rayfix_offline.twin import surfaces
 from rayfix_offline.twin.twin import Twin
 from rayfix_tables.angles import direction, local_to_scene
 from rayfix_tables.disk.schema import FORMAT_VERSION
 from rayfix_tables.site import Station
 
-BUILD_VERSION = 4
-"""Raised with every change of the software that makes another table of the same site."""
+BUILD_VERSION = 5
+"""Raised with every change of the software that makes another table of the same site; numbers are in the method."""
 
 BLOCK_CELLS = 256
 """Cells that one task fits and one shard holds."""
@@ -59,7 +53,7 @@ class Block:
 
     def only(self, cells: NDArray[np.int64]) -> "Block":
         """Return the block with some of its cells only."""
-        return dataclasses.replace(self, cells=cells)
+        return replace(self, cells=cells)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,12 +88,20 @@ class StationPlan:
         return sum(len(block.cells) for block in self.blocks)
 
 
-def plan_build(site: SiteFile, twin: Twin) -> tuple[StationPlan, ...]:
-    """Plan the build of a site."""
+def plan_build(site: SiteFile, twin: Twin, method: Method | None = None) -> tuple[StationPlan, ...]:
+    """Plan the build of a site.
+
+    Parameters
+    ----------
+    twin : Twin
+        Prepared by the same method.
+    method : Method, optional
+    """
+    method = method or Method()
     common = content_key(
         BUILD_VERSION,
         FORMAT_VERSION,
-        _method_settings(site, curved=twin.planes.curved),
+        method.identity(),
         twin.scene.sha256,
         hashlib.sha256(np.packbits(twin.free_space.free).tobytes()).hexdigest(),
         [*twin.free_space.origin.tolist(), twin.free_space.voxel_size, *twin.free_space.free.shape],
@@ -111,7 +113,7 @@ def plan_build(site: SiteFile, twin: Twin) -> tuple[StationPlan, ...]:
             section=section,
             station=station,
             part_id=content_key(common, section.built_from()),
-            blocks=_blocks(station, site),
+            blocks=_blocks(station, site, method),
         )
         for section, station in zip(site.stations, site.info().stations, strict=True)
     )
@@ -122,23 +124,12 @@ def updated_part_id(exact_part_id: str, former_part_id: str, tolerance: float) -
     return content_key("updated", exact_part_id, former_part_id, tolerance)
 
 
-def _method_settings(site: SiteFile, *, curved: bool) -> dict[str, float | dict[str, float]]:
-    fit = TubeFit() if site.table.fit == "tubes" else ExpectationMaximisation(seed=site.table.seed)
-    constants = {
-        f"{module.__name__}.{name}": value
-        for module in ((moments, trace, surfaces) if curved else (moments, trace))
-        for name, value in vars(module).items()
-        if name.isupper() and isinstance(value, int | float)
-    }
-    return {**constants, "fit": dataclasses.asdict(fit), "coarse": dataclasses.asdict(CoarseFit())}
-
-
-def _blocks(station: Station, site: SiteFile) -> tuple[Block, ...]:
+def _blocks(station: Station, site: SiteFile, method: Method) -> tuple[Block, ...]:
     """Cells of each level whose centre lies in the station's field of view or hardly outside, in blocks."""
     axis = local_to_scene(station.orientation)[:, 0]
     blocks: list[Block] = []
     for level, window in enumerate(np.deg2rad(site.table.windows_deg)):
-        centres = level_grid(float(window)).centres
+        centres = level_grid(float(window), cells_per_window=method.rays.cells_per_window).centres
         angle = np.arccos(np.clip(direction(centres[:, 0], centres[:, 1]) @ axis, -1.0, 1.0))
         cells = np.flatnonzero(angle <= 0.5 * station.field_of_view + window)
         size = WIDE_BLOCK_CELLS if level else BLOCK_CELLS

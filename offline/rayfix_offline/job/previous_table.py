@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.fit.cells import FittedCells
 from rayfix_offline.job.changes import cell_changes
+from rayfix_offline.job.method import Method
 from rayfix_offline.job.plan import Block, StationPlan, plan_build, updated_part_id
 from rayfix_offline.rays.trace import StationTrace, trace_station
 from rayfix_offline.scene.scene import Scene
@@ -58,12 +59,15 @@ class FormerStation:
         By which the part was built.
     site, twin : SiteFile, Twin
         For which the part was built.
+    method : Method
+        By which it was built, and the new one will be.
     """
 
     part: StationPart
     plan: StationPlan
     site: SiteFile
     twin: Twin
+    method: Method
 
     def kept_cells(self, trace: StationTrace, tolerance: float, *, jobs: int = 1) -> KeptCells:
         """Find the cells that have changed no more than a tolerance.
@@ -77,8 +81,12 @@ class FormerStation:
         jobs : int
             Threads; -1 for one per core.
         """
-        former = trace_station(self.plan.section, self.site, self.twin, jobs=jobs)
-        compared = cell_changes(former.finest, trace.finest)
+        method = self.method
+        former = trace_station(
+            self.plan.section, self.site, self.twin, settings=method.rays, reflection=method.reflection, jobs=jobs
+        )
+        cutoff = method.fit(self.site).cutoff
+        compared = cell_changes(former.finest, trace.finest, cutoff=cutoff, settings=method.comparison)
         change = np.full(len(compared), np.inf)
         for block in self.plan.finest_blocks:
             change[block.cells] = compared[block.cells]
@@ -90,9 +98,10 @@ class FormerStation:
 
 @dataclass(frozen=True, kw_only=True)
 class FormerTable:
-    """A table that was built before."""
+    """A table that was built before, and the method that the new one is built by."""
 
     table: Table
+    method: Method
 
     def whole_part(self, plan: StationPlan, tolerance: float) -> StationPart | None:
         """Return the part that a plan asks for, or one that was updated to it within the tolerance."""
@@ -117,7 +126,7 @@ class FormerTable:
                 return None
         if former_site.table != site.table or former.part_id != expected:
             return None
-        return FormerStation(part=part, plan=former, site=former_site, twin=twin)
+        return FormerStation(part=part, plan=former, site=former_site, twin=twin, method=self.method)
 
     @cached_property
     def _sound(self) -> bool:
@@ -143,12 +152,12 @@ class FormerTable:
             site = parse_site(self.table.site.document)
         except SiteError:
             return None
-        twin = prepare_scene(site, scene)
-        return site, twin, {plan.station.id: plan for plan in plan_build(site, twin)}
+        twin = prepare_scene(site, scene, self.method.twin)
+        return site, twin, {plan.station.id: plan for plan in plan_build(site, twin, self.method)}
 
 
 def read_former(
-    path: Path, *, required: bool, refused: Callable[[str], None] = lambda reason: None
+    path: Path, method: Method, *, required: bool, refused: Callable[[str], None] = lambda reason: None
 ) -> FormerTable | None:
     """Open a former table, checked in a process of its own.
 
@@ -165,7 +174,7 @@ def read_former(
         When a required table cannot be read.
     """
     try:
-        return FormerTable(table=open_checked(path, whole=False))
+        return FormerTable(table=open_checked(path, whole=False), method=method)
     except TableError as error:
         if required:
             raise

@@ -10,12 +10,14 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from rayfix_offline.fit.cells import FittedCells, assemble_changes, assemble_level, fit_cells, widen_cells
+from rayfix_offline.job.method import Method
 from rayfix_offline.job.plan import Block, StationPlan, updated_part_id
 from rayfix_offline.job.previous_table import FormerStation, FormerTable, KeptCells
 from rayfix_offline.job.shards import ShardStore
 from rayfix_offline.rays.trace import StationTrace, level_grid, trace_station
 from rayfix_offline.site import SiteFile
 from rayfix_offline.twin.twin import Twin
+from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.table import StationPart
 from rayfix_tables.update import Update
@@ -34,6 +36,8 @@ class Job:
 
     Attributes
     ----------
+    method : Method
+        By which the twin was prepared, and cells are fitted.
     jobs : int
         Cells that are fitted at a time; -1 for one per core.
     former : FormerTable, optional
@@ -45,6 +49,7 @@ class Job:
 
     site: SiteFile
     twin: Twin
+    method: Method
     store: ShardStore
     jobs: int
     former: FormerTable | None
@@ -61,11 +66,14 @@ class BuiltStation:
         Fitted now; some blocks from shards; some cells from a former table; all of it from there.
     num_kept_cells : int
         Cells of the finest level taken from the former table.
+    num_dropped : int
+        Components that were dropped, because they had no positive definite covariance; 0 for a part that was kept.
     """
 
     content: StationContent
     origin: str
     num_kept_cells: int
+    num_dropped: int
 
 
 def keep_station(plan: StationPlan, job: Job) -> BuiltStation | None:
@@ -73,7 +81,7 @@ def keep_station(plan: StationPlan, job: Job) -> BuiltStation | None:
     part = job.former.whole_part(plan, job.tolerance) if job.former else None
     if part is None:
         return None
-    return BuiltStation(content=_content_of(part), origin="kept", num_kept_cells=plan.num_finest_cells)
+    return BuiltStation(content=_content_of(part), origin="kept", num_kept_cells=plan.num_finest_cells, num_dropped=0)
 
 
 def build_station(plan: StationPlan, job: Job, remote: "Cluster | None", report: StationProgress) -> BuiltStation:
@@ -98,7 +106,14 @@ def build_station(plan: StationPlan, job: Job, remote: "Cluster | None", report:
         if remote is not None and former is None:
             launch, fitting = remote.launch(plan), remote.fit_blocks(plan, missing)
         else:
-            trace = trace_station(plan.section, job.site, job.twin, jobs=job.jobs)
+            trace = trace_station(
+                plan.section,
+                job.site,
+                job.twin,
+                settings=job.method.rays,
+                reflection=job.method.reflection,
+                jobs=job.jobs,
+            )
             if former is not None:
                 report(f"{plan.station.id}: comparing", done)
                 kept, missing = _split(missing, former.kept_cells(trace, job.tolerance, jobs=job.jobs))
@@ -129,6 +144,7 @@ def build_station(plan: StationPlan, job: Job, remote: "Cluster | None", report:
         content=_assemble(plan, job, former, levels, launch),
         origin="updated" if num_kept else "resumed" if resumed else "built",
         num_kept_cells=num_kept,
+        num_dropped=sum(int(fitted.dropped.sum()) for fitted in parts.values()),
     )
 
 
@@ -143,7 +159,8 @@ def _load(
     parts = {}
     for block in plan.blocks:
         arrays = store.load(f"{name}-{block.shard}")
-        if arrays is not None:
+        # Blocks of another size are other cells under the same name.
+        if arrays is not None and np.array_equal(arrays["cells"], block.cells):
             parts[block.key] = FittedCells.from_arrays(arrays)
     return store.load(f"{name}-launch"), parts
 
@@ -162,7 +179,8 @@ def _split(blocks: list[Block], kept: KeptCells) -> tuple[dict[tuple[int, int], 
 
 def _fit_blocks(blocks: list[Block], trace: StationTrace, job: Job) -> Iterator[tuple[Block, FittedCells]]:
     """Fit blocks in parallel; they come back in their order."""
-    tasks = (delayed(fit_cells)(block.cells, trace.finest, job.site) for block in blocks)
+    fit = job.method.fit(job.site)
+    tasks = (delayed(fit_cells)(block.cells, trace.finest, fit) for block in blocks)
     # The compiled kernels release the interpreter's lock, so threads share the rays without a copy; scikit-learn
     # holds it, so its fits need processes.
     return _in_parallel(blocks, tasks, job.jobs, "processes" if job.site.table.fit == "em" else "threads")
@@ -173,7 +191,7 @@ def _widen_blocks(
 ) -> Iterator[tuple[Block, FittedCells]]:
     """Make blocks of a wide level in parallel; they come back in their order."""
     tasks = (
-        delayed(widen_cells)(block.cells, window, level_grid(window), finer, finer_change)
+        delayed(widen_cells)(block.cells, window, _grid(window, job), finer, finer_change, job.method.wide)
         for block in blocks
         for window in [_window(block.level, job)]
     )
@@ -197,12 +215,16 @@ def _window(level: int, job: Job) -> float:
     return float(np.deg2rad(job.site.table.windows_deg[level]))
 
 
+def _grid(window: float, job: Job) -> AngularGrid:
+    return level_grid(window, cells_per_window=job.method.rays.cells_per_window)
+
+
 def _assemble_level(
     level: int, job: Job, parts: dict[tuple[int, int], FittedCells]
 ) -> tuple[Level, NDArray[np.float32]]:
     """Put the blocks of a level together, and the changes of its cells."""
     window = _window(level, job)
-    grid = level_grid(window)
+    grid = _grid(window, job)
     blocks = [parts[key] for key in sorted(parts) if key[0] == level]
     return assemble_level(window, grid, blocks), assemble_changes(grid, blocks)
 

@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.rays.segments import Segments, Sequences
+from rayfix_offline.rays.settings import RaySettings
 from rayfix_offline.scene.engine import RayEngine
 from rayfix_offline.scene.materials import Reflectivity
 from rayfix_offline.twin.planes import Planes
-
-OFFSET = 1e-5
-"""A reflected ray starts this times (1 + largest coordinate) off its mirror, m."""
 
 
 def launch(
@@ -31,6 +29,7 @@ def launch(
     bounds: NDArray[np.float64],
     max_reflections: int,
     max_path_length: float,
+    mirror_offset: float = RaySettings.mirror_offset,
 ) -> Segments:
     """Launch rays and mirror them at what they hit.
 
@@ -45,9 +44,11 @@ def launch(
         Low and high corner of the scene; a ray that hits nothing ends there.
     max_path_length : float, m
         Rays end at this unfolded length.
+    mirror_offset : float
+        A reflected ray starts this times (1 + largest coordinate in m) off its mirror.
     """
     num_rays = len(directions)
-    offset = OFFSET * (1.0 + float(np.abs(bounds).max()))
+    offset = mirror_offset * (1.0 + float(np.abs(bounds).max()))
     sequence = np.full((num_rays, max_reflections + 1), -1, np.int32)
     start = np.zeros(sequence.shape)
     end = np.zeros(sequence.shape)

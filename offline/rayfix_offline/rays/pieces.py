@@ -19,10 +19,8 @@ from rayfix_offline.rays.launch import turned
 from rayfix_offline.rays.pathprior import PathPrior, reflection_factors
 from rayfix_offline.rays.rays import RaySet
 from rayfix_offline.rays.segments import Segments
+from rayfix_offline.rays.settings import RaySettings
 from rayfix_offline.rays.voxelwalk import GAUSS, new_crossings, over_ray_ranges, power, walk
-
-FIRST_NODE = 0.25
-"""Length of the first slice node, m; whatever is nearer belongs to it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +73,7 @@ def cut_pieces(
     exponent: float,
     kind: Literal["power", "uniform", "paper"],
     slice_ratio: float,
+    first_node: float = RaySettings.first_node,
     jobs: int = 1,
 ) -> Pieces:
     """Cut rays into pieces.
@@ -87,10 +86,12 @@ def cut_pieces(
         Weight along a ray: s^2 pi, s^2, or 1.
     slice_ratio : float
         Ratio of a slice's node to the one before.
+    first_node : float, m
+        Path length of the first slice's node; shorter lengths belong to the first slice.
     jobs : int
         Threads; -1 for one per core. The pieces are the same with any number.
     """
-    nodes = slice_nodes(float(segments.end.max(initial=0.0)), slice_ratio)
+    nodes = slice_nodes(float(segments.end.max(initial=0.0)), slice_ratio, first_node)
     counts = _count(segments.sequence, segments.start, segments.end, nodes)
     offsets = np.concatenate([[0], np.cumsum(counts)])
     total = int(offsets[-1])
@@ -134,10 +135,10 @@ def cut_pieces(
     return pieces
 
 
-def slice_nodes(longest: float, slice_ratio: float) -> NDArray[np.float64]:
+def slice_nodes(longest: float, slice_ratio: float, first_node: float) -> NDArray[np.float64]:
     """Lengths at which slices peak, up to the first beyond ``longest``, m."""
-    count = int(np.ceil(np.log(max(longest / FIRST_NODE, 1.0)) / np.log(slice_ratio))) + 2
-    return np.asarray(FIRST_NODE * slice_ratio ** np.arange(count))
+    count = int(np.ceil(np.log(max(longest / first_node, 1.0)) / np.log(slice_ratio))) + 2
+    return np.asarray(first_node * slice_ratio ** np.arange(count))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -11,29 +11,12 @@ from rayfix_offline.rays.pathprior import fill_path_prior
 from rayfix_offline.rays.pieces import Pieces, cut_pieces
 from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments, Sequences
+from rayfix_offline.rays.settings import RaySettings
 from rayfix_offline.rays.surface_sequences import surface_sequences
-from rayfix_offline.scene.materials import Reflectivity, constant_reflectivity, itu_reflectivity
+from rayfix_offline.scene.materials import ReflectionSettings, Reflectivity, constant_reflectivity, itu_reflectivity
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin.twin import Twin
 from rayfix_tables.grid import AngularGrid
-
-RAYS_PER_WINDOW = 3.0
-"""Rays lie this many times as close as the finest window's standard deviation."""
-
-CELLS_PER_WINDOW = 0.8
-"""Cells are this many times as close as their window's standard deviation."""
-
-SLICE_RATIO = 1.2
-"""Ratio of a slice's length to the one before."""
-
-PRIOR_REFINEMENT = 2
-"""A voxel of the path prior is this many voxels of the free space wide."""
-
-PRIOR_RAYS = 0.7
-"""At the far end of the scene, the rays that fill the path prior lie this many of its voxels apart, or closer."""
-
-PRIOR_SPACING = 0.0073
-"""Rays that are launched for the path prior's sake need not lie closer than this, rad."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,18 +64,20 @@ class StationTrace:
         return {"lost_ray_share": np.array(self.lost_ray_share), "coverage": np.array(self.coverage)}
 
 
-def level_grid(window: float) -> AngularGrid:
-    """Grid of the cells of a window [rad]."""
-    return AngularGrid.from_spacing(window / CELLS_PER_WINDOW)
+def level_grid(window: float, *, cells_per_window: float = RaySettings.cells_per_window) -> AngularGrid:
+    """Grid of the cells of a window [rad], which are this many times as close as its standard deviation."""
+    return AngularGrid.from_spacing(window / cells_per_window)
 
 
-def prior_spacing(twin: Twin) -> float:
+def prior_spacing(twin: Twin, settings: RaySettings | None = None) -> float:
     """Largest spacing of the rays that fill a site's path prior, rad."""
+    settings = settings or RaySettings()
     far = float(np.linalg.norm(twin.scene.bounds[1] - twin.scene.bounds[0]))
-    return max(PRIOR_SPACING, PRIOR_RAYS * PRIOR_REFINEMENT * twin.free_space.voxel_size / far)
+    wanted = settings.prior_rays * settings.prior_refinement * twin.free_space.voxel_size / far
+    return max(settings.prior_spacing, wanted)
 
 
-def reflectivity_of(site: SiteFile, twin: Twin) -> Reflectivity:
+def reflectivity_of(site: SiteFile, twin: Twin, settings: ReflectionSettings | None = None) -> Reflectivity:
     """Return what the triangles of a site's scene reflect."""
     propagation, scene = site.propagation, twin.scene
     if propagation.reflection == "constant":
@@ -102,30 +87,58 @@ def reflectivity_of(site: SiteFile, twin: Twin) -> Reflectivity:
         scene.materials,
         carrier_ghz=propagation.carrier_ghz,
         loss_db=propagation.reflection_loss_db,
+        settings=settings,
     )
 
 
-def trace_station(station: StationSection, site: SiteFile, twin: Twin, *, jobs: int = 1) -> StationTrace:
+def trace_station(
+    station: StationSection,
+    site: SiteFile,
+    twin: Twin,
+    *,
+    settings: RaySettings | None = None,
+    reflection: ReflectionSettings | None = None,
+    jobs: int = 1,
+) -> StationTrace:
     """Launch a station's rays and cut them into pieces.
 
     The directions depend on the site's seed and the station's id alone.
 
     Parameters
     ----------
+    settings : RaySettings, optional
+    reflection : ReflectionSettings, optional
     jobs : int
         Threads; -1 for one per core. The trace is the same with any number.
     """
+    settings = settings or RaySettings()
     window = float(np.deg2rad(site.table.windows_deg[0]))
-    spacing = window / RAYS_PER_WINDOW
+    spacing = window / settings.rays_per_window
+    widest = prior_spacing(twin, settings)
+    reflectivity = reflectivity_of(site, twin, reflection)
+
+    def launched(spacing: float, *seed: int) -> tuple[RaySet, Segments]:
+        return launch_rays(
+            station,
+            site,
+            twin,
+            spacing,
+            np.random.default_rng([site.table.seed, *seed]),
+            reflectivity=reflectivity,
+            mirror_offset=settings.mirror_offset,
+        )
+
     name = int.from_bytes(hashlib.sha256(station.id.encode()).digest()[:8], "big")
-    rays, segments = launch_rays(station, site, twin, spacing, np.random.default_rng([site.table.seed, name]))
-    prior_rays, prior_segments = rays, segments
-    if spacing > prior_spacing(twin):
-        rng = np.random.default_rng([site.table.seed, name, 1])
-        prior_rays, prior_segments = launch_rays(station, site, twin, prior_spacing(twin), rng)
+    rays, segments = launched(spacing, name)
+    prior_rays, prior_segments = launched(widest, name, 1) if spacing > widest else (rays, segments)
     exponent = site.propagation.path_prior_exponent
     prior = fill_path_prior(
-        prior_rays, prior_segments, twin.free_space, exponent=exponent, refinement=PRIOR_REFINEMENT, jobs=jobs
+        prior_rays,
+        prior_segments,
+        twin.free_space,
+        exponent=exponent,
+        refinement=settings.prior_refinement,
+        jobs=jobs,
     )
     pieces = cut_pieces(
         rays,
@@ -133,12 +146,13 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin, *, jobs: 
         prior,
         exponent=exponent,
         kind=site.propagation.path_prior,
-        slice_ratio=SLICE_RATIO,
+        slice_ratio=settings.slice_ratio,
+        first_node=settings.first_node,
         jobs=jobs,
     )
     finest = LevelRays(
         window=window,
-        grid=level_grid(window),
+        grid=level_grid(window, cells_per_window=settings.cells_per_window),
         rays=rays,
         ray_spacing=spacing,
         pieces=pieces,
@@ -149,7 +163,14 @@ def trace_station(station: StationSection, site: SiteFile, twin: Twin, *, jobs: 
 
 
 def launch_rays(
-    station: StationSection, site: SiteFile, twin: Twin, spacing: float, rng: np.random.Generator
+    station: StationSection,
+    site: SiteFile,
+    twin: Twin,
+    spacing: float,
+    rng: np.random.Generator,
+    *,
+    reflectivity: Reflectivity | None = None,
+    mirror_offset: float = RaySettings.mirror_offset,
 ) -> tuple[RaySet, Segments]:
     """Launch a station's rays.
 
@@ -157,6 +178,10 @@ def launch_rays(
     ----------
     spacing : float, rad
         Between neighbouring rays.
+    reflectivity : Reflectivity, optional
+        The site's when left out.
+    mirror_offset : float
+        See :func:`~rayfix_offline.rays.launch.launch`.
     """
     rays = sample_rays(spacing, rng)
     segments = launch(
@@ -164,9 +189,10 @@ def launch_rays(
         rays.directions,
         engine=twin.engine,
         planes=twin.planes,
-        reflectivity=reflectivity_of(site, twin),
+        reflectivity=reflectivity if reflectivity is not None else reflectivity_of(site, twin),
         bounds=twin.scene.bounds,
         max_reflections=site.propagation.max_reflections,
         max_path_length=site.propagation.max_path_length_m,
+        mirror_offset=mirror_offset,
     )
     return rays, segments

@@ -5,7 +5,7 @@ a report does not tell how the transmitter holds its antenna.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,10 +13,21 @@ from numpy.typing import ArrayLike, NDArray
 VACUUM_PERMITTIVITY = 8.8541878128e-12
 """F/m."""
 
-LEAST_POWER = 1e-12
-"""A reflection leaves at least this share of the power, so that logarithms stay finite (vacuum reflects nothing)."""
 
-_GRAZING = 1e-12
+@dataclass(frozen=True, kw_only=True)
+class ReflectionSettings:
+    """Settings of reflections; part of the identity of every station's part of a table.
+
+    Attributes
+    ----------
+    least_power : float
+        A reflection leaves at least this fraction of the power, so that logarithms are finite.
+    grazing_cosine : float
+        Below this cosine of the angle of incidence, any material reflects all of the power.
+    """
+
+    least_power: float = 1e-12
+    grazing_cosine: float = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,10 +86,12 @@ class Reflectivity:
         Complex relative permittivity of each triangle; NaN where the constant loss holds.
     loss_db : float
         The constant loss.
+    settings : ReflectionSettings
     """
 
     permittivity: NDArray[np.complex128]
     loss_db: float
+    settings: ReflectionSettings = field(default_factory=ReflectionSettings)
 
     def log_gain(self, faces: NDArray[np.int32], cos_incidence: NDArray[np.float64]) -> NDArray[np.float64]:
         """Logarithm to base 10 of the reflected share of the power.
@@ -93,8 +106,9 @@ class Reflectivity:
         known = np.isfinite(permittivity)
         out = np.full(len(faces), -0.1 * self.loss_db)
         if known.any():
-            power = fresnel_power(cos_incidence[known], permittivity[known])
-            out[known] = np.log10(np.maximum(power, LEAST_POWER))
+            grazing = self.settings.grazing_cosine
+            power = fresnel_power(cos_incidence[known], permittivity[known], grazing_cosine=grazing)
+            out[known] = np.log10(np.maximum(power, self.settings.least_power))
         return out
 
     def power(self, faces: NDArray[np.int32], cos_incidence: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -108,7 +122,12 @@ def constant_reflectivity(num_faces: int, *, loss_db: float) -> Reflectivity:
 
 
 def itu_reflectivity(
-    face_materials: NDArray[np.int16], materials: tuple[str, ...], *, carrier_ghz: float, loss_db: float
+    face_materials: NDArray[np.int16],
+    materials: tuple[str, ...],
+    *,
+    carrier_ghz: float,
+    loss_db: float,
+    settings: ReflectionSettings | None = None,
 ) -> Reflectivity:
     """Return triangles that reflect as their materials do.
 
@@ -118,8 +137,10 @@ def itu_reflectivity(
         Index into ``materials``; -1 for none.
     loss_db : float
         Loss of triangles without a material, or with one that :func:`complex_permittivity` does not know.
+    settings : ReflectionSettings, optional
     """
-    return Reflectivity(permittivity=face_permittivity(face_materials, materials, carrier_ghz), loss_db=loss_db)
+    permittivity = face_permittivity(face_materials, materials, carrier_ghz)
+    return Reflectivity(permittivity=permittivity, loss_db=loss_db, settings=settings or ReflectionSettings())
 
 
 def face_permittivity(
@@ -169,7 +190,9 @@ def complex_permittivity(name: str, carrier_ghz: float) -> complex | None:
     return None
 
 
-def fresnel_power(cos_incidence: ArrayLike, permittivity: ArrayLike) -> NDArray[np.float64]:
+def fresnel_power(
+    cos_incidence: ArrayLike, permittivity: ArrayLike, *, grazing_cosine: float = ReflectionSettings.grazing_cosine
+) -> NDArray[np.float64]:
     """Share of the power that a half space reflects, the mean of both polarisations.
 
     With the coefficients r_TE and r_TM of ITU-R P.2040-3 for a single interface and a wave that comes from air.
@@ -180,29 +203,31 @@ def fresnel_power(cos_incidence: ArrayLike, permittivity: ArrayLike) -> NDArray[
         Cosine of the angle between ray and normal, in [0, 1].
     permittivity : ndarray of complex
         Complex relative permittivity; arrays broadcast.
+    grazing_cosine : float
+        Below this cosine, all of the power is reflected.
 
     Returns
     -------
     ndarray
         In [0, 1].
     """
-    te, tm = fresnel_coefficients(cos_incidence, permittivity)
+    te, tm = fresnel_coefficients(cos_incidence, permittivity, grazing_cosine=grazing_cosine)
     return np.asarray(np.minimum(0.5 * (np.abs(te) ** 2 + np.abs(tm) ** 2), 1.0))
 
 
 def fresnel_coefficients(
-    cos_incidence: ArrayLike, permittivity: ArrayLike
+    cos_incidence: ArrayLike, permittivity: ArrayLike, *, grazing_cosine: float = ReflectionSettings.grazing_cosine
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     """Reflection coefficients of the electric field, transverse electric and transverse magnetic.
 
-    See :func:`fresnel_power`; a grazing ray, at a cosine below 1e-12, is reflected as a whole by any material.
+    See :func:`fresnel_power`; any material reflects all of a grazing ray, at a cosine below ``grazing_cosine``.
     """
     cos, eps = np.broadcast_arrays(
         np.clip(np.asarray(cos_incidence, np.float64), 0.0, 1.0), np.asarray(permittivity, np.complex128)
     )
     # eps - sin^2, without the cancellation of 1 - sin^2 at grazing incidence.
     root = np.sqrt(eps - 1.0 + cos**2)
-    grazing = cos < _GRAZING
+    grazing = cos < grazing_cosine
     te = np.where(grazing, -1.0, (cos - root) / np.where(grazing, 1.0, cos + root))
     tm = np.where(grazing, -1.0, (eps * cos - root) / np.where(grazing, 1.0, eps * cos + root))
     return te, tm

@@ -7,16 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.scene.scene import Scene
-from rayfix_offline.twin.solids import TOUCH, Part, is_inside, touched
-
-HALL_SHARE = 0.05
-"""A building takes up more than this share of the scene's bounding box."""
-
-INNER_SHARE = 0.5
-"""The inner faces of walls take up more than this share of what their outer faces enclose."""
-
-MOST_PARTS = 200
-"""Parts that are looked at to tell what is in a building."""
+from rayfix_offline.twin.settings import TwinSettings
+from rayfix_offline.twin.solids import Part, is_inside, touched
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +30,9 @@ class Enclosures:
     inside: NDArray[np.bool_]
 
 
-def find_enclosures(scene: Scene, parts: Sequence[Part], stations: NDArray[np.float64]) -> Enclosures:
+def find_enclosures(
+    scene: Scene, parts: Sequence[Part], stations: NDArray[np.float64], settings: TwinSettings | None = None
+) -> Enclosures:
     """Tell buildings from solids.
 
     A closed part with a station in it is a building or a solid that the station was misplaced into. What lies in such
@@ -52,12 +46,15 @@ def find_enclosures(scene: Scene, parts: Sequence[Part], stations: NDArray[np.fl
     Parameters
     ----------
     stations : ndarray of shape (n_stations, 3), m
+    settings : TwinSettings, optional
     """
-    inside = _stations_inside(scene, parts, stations)
+    settings = settings or TwinSettings()
+    touch = settings.touch
+    inside = _stations_inside(scene, parts, stations, touch)
     candidates = [i for i in range(len(parts)) if inside[i].any()]
     boxes = np.array([_box(scene, part) for part in parts])
-    contents = _contents(scene, parts, candidates, boxes)
-    outer = {i: _container(i, candidates, parts, inside, boxes) for i in candidates}
+    contents = _contents(scene, parts, candidates, boxes, settings.max_parts)
+    outer = {i: _container(i, candidates, parts, inside, boxes, touch) for i in candidates}
     enclosing = np.zeros(len(parts), bool)
     extent = np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)
     for i in candidates:
@@ -75,9 +72,11 @@ def find_enclosures(scene: Scene, parts: Sequence[Part], stations: NDArray[np.fl
         more = held > int(loose_stations.sum()) + int(loose_parts.sum())
         if outer[i] < 0:
             inwards = parts[i].consistent and parts[i].volume < 0.0
-            enclosing[i] = abs(parts[i].volume) > HALL_SHARE * size and (inside[i].mean() > 0.5 or more or inwards)
+            enclosing[i] = abs(parts[i].volume) > settings.building_fraction * size and (
+                inside[i].mean() > 0.5 or more or inwards
+            )
         else:
-            filled = sum(abs(parts[k].volume) for k in within) > INNER_SHARE * size
+            filled = sum(abs(parts[k].volume) for k in within) > settings.inner_fraction * size
             enclosing[i] = more and (filled or bool(contents[candidates.index(i)].any()))
     rooms = enclosing.copy()
     for i in candidates:
@@ -86,14 +85,16 @@ def find_enclosures(scene: Scene, parts: Sequence[Part], stations: NDArray[np.fl
     return Enclosures(enclosing=enclosing, rooms=rooms, inside=inside)
 
 
-def _stations_inside(scene: Scene, parts: Sequence[Part], stations: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _stations_inside(
+    scene: Scene, parts: Sequence[Part], stations: NDArray[np.float64], touch: float
+) -> NDArray[np.bool_]:
     inside = np.zeros((len(parts), len(stations)), bool)
     for i, part in enumerate(parts):
         if part.closed:
             triangles = scene.triangles[part.faces]
             low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-            for s in np.flatnonzero(np.all((stations >= low - TOUCH) & (stations <= high + TOUCH), axis=1)):
-                inside[i, s] = is_inside(triangles, stations[s]) or touched(triangles, stations[s]) >= 0
+            for s in np.flatnonzero(np.all((stations >= low - touch) & (stations <= high + touch), axis=1)):
+                inside[i, s] = is_inside(triangles, stations[s]) or touched(triangles, stations[s], touch=touch) >= 0
     return inside
 
 
@@ -103,7 +104,12 @@ def _box(scene: Scene, part: Part) -> NDArray[np.float64]:
 
 
 def _container(
-    i: int, candidates: list[int], parts: Sequence[Part], inside: NDArray[np.bool_], boxes: NDArray[np.float64]
+    i: int,
+    candidates: list[int],
+    parts: Sequence[Part],
+    inside: NDArray[np.bool_],
+    boxes: NDArray[np.float64],
+    touch: float,
 ) -> int:
     """Smallest part with stations that part i lies in, -1 for none."""
     around = [
@@ -111,18 +117,18 @@ def _container(
         for j in candidates
         if abs(parts[j].volume) > abs(parts[i].volume)
         and np.all(inside[j] | ~inside[i])
-        and np.all(boxes[j, 0] <= boxes[i, 0] + TOUCH)
-        and np.all(boxes[j, 1] >= boxes[i, 1] - TOUCH)
+        and np.all(boxes[j, 0] <= boxes[i, 0] + touch)
+        and np.all(boxes[j, 1] >= boxes[i, 1] - touch)
     ]
     return min(around, key=lambda j: abs(parts[j].volume), default=-1)
 
 
 def _contents(
-    scene: Scene, parts: Sequence[Part], candidates: list[int], boxes: NDArray[np.float64]
+    scene: Scene, parts: Sequence[Part], candidates: list[int], boxes: NDArray[np.float64], max_parts: int
 ) -> NDArray[np.bool_]:
     """Which closed parts without stations lie in the candidates, shape (n_candidates, n_looked_at)."""
     others = [i for i, part in enumerate(parts) if part.closed and i not in set(candidates)]
-    looked_at = others[:: max(1, -(-len(others) // MOST_PARTS))]
+    looked_at = others[:: max(1, -(-len(others) // max_parts))]
     out = np.zeros((len(candidates), len(looked_at)), bool)
     middles = np.array([scene.triangles[parts[k].faces].mean(axis=(0, 1)) for k in looked_at]).reshape(-1, 3)
     for n, i in enumerate(candidates):

@@ -165,27 +165,34 @@ def material_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
         )
 
 
-def station_findings(site: SiteFile, scene: Scene, parts: Sequence[Part], enclosures: Enclosures) -> Iterator[Finding]:
-    """Find stations where none can be."""
+def station_findings(
+    site: SiteFile, scene: Scene, parts: Sequence[Part], enclosures: Enclosures, *, touch: float
+) -> Iterator[Finding]:
+    """Find stations where none can be; one nearer than ``touch`` [m] to a surface lies on it."""
     outside = _what_would_hold_stations(site, scene) or "correct position_m or scene_unit"
     for s, station in enumerate(site.stations):
         position = np.array(station.position_m)
         place = _placed(station)
-        problem = _misplacement(position, scene, parts, enclosures, s)
+        problem = _misplacement(position, scene, parts, enclosures, s, touch)
         if problem is not None:
             where, remedy = problem
             yield error("station", f"{place} lies {where}", remedy or outside, station_id=station.id)
 
 
 def _misplacement(
-    position: NDArray[np.float64], scene: Scene, parts: Sequence[Part], enclosures: Enclosures, station: int
+    position: NDArray[np.float64],
+    scene: Scene,
+    parts: Sequence[Part],
+    enclosures: Enclosures,
+    station: int,
+    touch: float,
 ) -> tuple[str, str] | None:
     """Where a station is that cannot be there, and the remedy, empty where it is far off; None where all is well."""
     low, high = scene.bounds
     if np.any(position < low) or np.any(position > high):
         box = " to ".join(f"({', '.join(f'{v:g}' for v in corner)})" for corner in (low, high))
         return f"outside the scene, which spans {box} m", ""
-    face = touched(scene.triangles, position)
+    face = touched(scene.triangles, position, touch=touch)
     if face >= 0:
         return f"on the surface of '{scene.objects[scene.face_objects[face]]}'", "move it a few centimetres off"
     held = [int(p) for p in np.flatnonzero(enclosures.inside[:, station]) if not enclosures.enclosing[p]]

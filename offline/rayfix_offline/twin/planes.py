@@ -6,13 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.topology import connect, number_rows
-
-TOLERANCE = 1e-3
-"""Triangles whose planes differ by less than this over the whole scene are coplanar, m."""
-
-ROUNDING = 0.1
-"""Planes are compared to this share of the tolerance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +45,12 @@ class Planes:
         return len(self.offsets)
 
 
-def merge_coplanar(triangles: NDArray[np.float64], *, tolerance: float = TOLERANCE) -> Planes:
+def merge_coplanar(
+    triangles: NDArray[np.float64],
+    *,
+    tolerance: float = TwinSettings.plane_tolerance,
+    rounding: float = TwinSettings.plane_rounding,
+) -> Planes:
     """Find the planes of triangles; triangles of one plane need not touch, and each plane is a surface by itself.
 
     Parameters
@@ -58,6 +58,8 @@ def merge_coplanar(triangles: NDArray[np.float64], *, tolerance: float = TOLERAN
     triangles : ndarray of shape (n_faces, 3, 3), m
     tolerance : float, m
         Largest distance between merged planes anywhere within the scene.
+    rounding : float
+        Planes are rounded to this fraction of the tolerance before they are compared.
     """
     corners = triangles.reshape(-1, 3)
     centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
@@ -71,7 +73,7 @@ def merge_coplanar(triangles: NDArray[np.float64], *, tolerance: float = TOLERAN
     features = np.concatenate([normals * radius, offsets[:, None]], axis=1)
     both = np.concatenate([features, -features])
     # Rounded first: the pairs among thousands of triangles of one floor would be millions.
-    step = ROUNDING * tolerance
+    step = rounding * tolerance
     steps = np.round(both / step)
     inverse = number_rows(steps)
     rounded = steps[np.unique(inverse, return_index=True)[1]]

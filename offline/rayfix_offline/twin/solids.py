@@ -12,14 +12,9 @@ from scipy import ndimage
 from trimesh.triangles import closest_point
 
 from rayfix_offline.scene.scene import Scene
+from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.topology import Topology
 from rayfix_tables.freespace import FreeSpace
-
-MAX_VOXELS = 20_000_000
-"""The free space of a large building is cut more coarsely rather than into more voxels than this."""
-
-TOUCH = 1e-3
-"""Whatever is nearer to a surface lies on it, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,13 +135,15 @@ def is_inside(triangles: NDArray[np.float64], point: NDArray[np.float64]) -> boo
     return votes >= 2
 
 
-def touched(triangles: NDArray[np.float64], point: NDArray[np.float64]) -> int:
+def touched(triangles: NDArray[np.float64], point: NDArray[np.float64], *, touch: float = TwinSettings.touch) -> int:
     """Triangle that a point lies on, on neither side of it.
 
     Parameters
     ----------
     triangles : ndarray of shape (n, 3, 3), m
     point : ndarray of shape (3,), m
+    touch : float, m
+        A point nearer than this to a triangle lies on it.
 
     Returns
     -------
@@ -154,17 +151,24 @@ def touched(triangles: NDArray[np.float64], point: NDArray[np.float64]) -> int:
         Index of the triangle, -1 for none.
     """
     near = np.flatnonzero(
-        np.all((triangles.min(axis=1) <= point + TOUCH) & (triangles.max(axis=1) >= point - TOUCH), axis=1)
+        np.all((triangles.min(axis=1) <= point + touch) & (triangles.max(axis=1) >= point - touch), axis=1)
     )
     if not len(near):
         return -1
     closest = closest_point(triangles[near], np.broadcast_to(point, (len(near), 3)))
     distance = np.linalg.norm(closest - point, axis=1)
     nearest = int(distance.argmin())
-    return int(near[nearest]) if distance[nearest] < TOUCH else -1
+    return int(near[nearest]) if distance[nearest] < touch else -1
 
 
-def map_free_space(scene: Scene, *, solids: Sequence[Part], rooms: Sequence[Part], voxel_size: float) -> FreeSpace:
+def map_free_space(
+    scene: Scene,
+    *,
+    solids: Sequence[Part],
+    rooms: Sequence[Part],
+    voxel_size: float,
+    max_voxels: int = TwinSettings.max_voxels,
+) -> FreeSpace:
     """Mark the voxels whose centres lie outside all solids and, where there are rooms, inside one.
 
     Parameters
@@ -172,13 +176,14 @@ def map_free_space(scene: Scene, *, solids: Sequence[Part], rooms: Sequence[Part
     solids, rooms : sequence of Part
         Closed parts.
     voxel_size : float, m
-        Grows when the scene would take more than MAX_VOXELS.
+        Grows when the scene would take more than ``max_voxels``.
+    max_voxels : int
     """
     low, high = scene.bounds
     extent = np.maximum(high - low, voxel_size)
-    voxel_size = max(voxel_size, float((np.prod(extent) / MAX_VOXELS) ** (1.0 / 3.0)))
+    voxel_size = max(voxel_size, float((np.prod(extent) / max_voxels) ** (1.0 / 3.0)))
     # Across a flat scene a voxel may be larger than the scene, and is one nevertheless.
-    while float(np.prod(np.ceil(extent / voxel_size))) > 2.0 * MAX_VOXELS:
+    while float(np.prod(np.ceil(extent / voxel_size))) > 2.0 * max_voxels:
         voxel_size *= 1.1
     shape = tuple(int(n) for n in np.ceil(extent / voxel_size - 1e-9))
     free = np.full(shape, not rooms)

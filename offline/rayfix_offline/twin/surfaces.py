@@ -12,27 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.twin.planes import Planes
+from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.topology import Topology, connect
 
-SURFACE_ANGLE = float(np.deg2rad(10.0))
-"""Normals of a surface lie within this angle of those of the facet that it grew from.
 
-A reflected ray turns by twice as much as the normal. What a surface sends on to a distance D lies on an arc of at most
-40 deg, which one Gaussian replaces: the arc bulges by 0.06 D. A full turn takes 18 to 36 surfaces, however many facets
-it has.
-"""
-
-FACET_SIZE = 0.5
-"""Flat patches larger than a square of this side, or wider than a strip of half of it, stay mirrors of their own, m.
-
-They are few, and sharp mirrors: the wall beside a rounded corner must not be blurred by the corner.
-"""
-
-
-def join_facets(triangles: NDArray[np.float64], planes: Planes, topology: Topology) -> Planes:
+def join_facets(
+    triangles: NDArray[np.float64],
+    planes: Planes,
+    topology: Topology,
+    *,
+    surface_angle: float = TwinSettings.surface_angle,
+    facet_size: float = TwinSettings.facet_size,
+) -> Planes:
     """Find the curved surfaces of a scene.
 
-    Small facets that share an edge make up a surface, as far as their normals stay within ``SURFACE_ANGLE`` of the
+    Small facets that share an edge make up a surface, as far as their normals stay within ``surface_angle`` of the
     first one's.
 
     Parameters
@@ -40,6 +34,9 @@ def join_facets(triangles: NDArray[np.float64], planes: Planes, topology: Topolo
     triangles : ndarray of shape (n_faces, 3, 3), m
     planes : Planes
         Of the triangles.
+    surface_angle : float, rad
+    facet_size : float, m
+        See :class:`~rayfix_offline.twin.settings.TwinSettings`.
 
     Returns
     -------
@@ -50,17 +47,17 @@ def join_facets(triangles: NDArray[np.float64], planes: Planes, topology: Topolo
     first, second = topology.neighbours()
     faces = np.stack([first // 3, second // 3], axis=1)
     flat = planes.face_planes[faces[:, 0]] == planes.face_planes[faces[:, 1]]
-    small = _patch_sizes(triangles, faces[flat], np.concatenate([first[flat], second[flat]])) <= FACET_SIZE
+    small = _patch_sizes(triangles, faces[flat], np.concatenate([first[flat], second[flat]])) <= facet_size
     both = small[faces].all(axis=1)
     first, second, faces = first[both], second[both], faces[both]
-    smooth = faces[_fold_cosines(triangles, first, second) >= np.cos(SURFACE_ANGLE)]
+    smooth = faces[_fold_cosines(triangles, first, second) >= np.cos(surface_angle)]
     count = len(triangles)
     ends = np.concatenate([smooth, smooth[:, ::-1]])
     ends = ends[np.argsort(ends[:, 0], kind="stable")]
     offsets = np.concatenate([[0], np.cumsum(np.bincount(ends[:, 0], minlength=count))])
     crosses = _crosses(triangles)
     normals = crosses / np.linalg.norm(crosses, axis=1)[:, None]
-    return _split(planes, _grow(offsets, ends[:, 1], normals, np.cos(SURFACE_ANGLE)))
+    return _split(planes, _grow(offsets, ends[:, 1], normals, np.cos(surface_angle)))
 
 
 def _crosses(triangles: NDArray[np.float64]) -> NDArray[np.float64]:

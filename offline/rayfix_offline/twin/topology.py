@@ -8,9 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from rayfix_offline.scene.scene import Scene
-
-WELD = 1e-6
-"""Vertices whose coordinates round to the same multiple of this are one point, m."""
+from rayfix_offline.twin.settings import TwinSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,9 +123,15 @@ def number_rows(rows: NDArray[np.float64]) -> NDArray[np.int64]:
     return number
 
 
-def find_topology(scene: Scene) -> Topology:
-    """Weld the corners of a scene's triangles and find their edges."""
-    points = number_rows(np.round(scene.vertices / WELD))[scene.faces]
+def find_topology(scene: Scene, *, weld: float = TwinSettings.weld) -> Topology:
+    """Weld the corners of a scene's triangles and find their edges.
+
+    Parameters
+    ----------
+    weld : float, m
+        Vertices whose coordinates round to the same multiple of this are one point.
+    """
+    points = number_rows(np.round(scene.vertices / weld))[scene.faces]
     ends = np.roll(points, -1, axis=1)
     keys = np.minimum(points, ends) * (int(points.max()) + 1) + np.maximum(points, ends)
     edges = np.unique(keys, return_inverse=True)[1].reshape(points.shape)

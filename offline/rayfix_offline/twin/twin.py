@@ -19,14 +19,12 @@ from rayfix_offline.twin.findings import (
     station_findings,
 )
 from rayfix_offline.twin.planes import Planes, merge_coplanar
+from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.solids import map_free_space, sealed_space, split_parts
 from rayfix_offline.twin.surfaces import join_facets
 from rayfix_offline.twin.topology import find_topology
 from rayfix_tables.errors import SceneError
 from rayfix_tables.freespace import FreeSpace
-
-VOXEL_SIZE = 0.1
-"""Edge of a voxel of the free space, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,37 +39,41 @@ class Twin:
     findings: tuple[Finding, ...]
 
 
-def prepare_twin(site: SiteFile, folder: Path) -> Twin:
+def prepare_twin(site: SiteFile, folder: Path, settings: TwinSettings | None = None) -> Twin:
     """Load and check the scene of a site.
 
     Parameters
     ----------
     folder : Path
         The site file's; the scene's path is relative to it.
+    settings : TwinSettings, optional
 
     Raises
     ------
     SceneError
         When the scene cannot be read. What is wrong with a readable scene is in the twin's findings.
     """
-    return prepare_scene(site, load_scene(folder / site.site.scene, unit=site.site.scene_unit, up=site.site.scene_up))
+    scene = load_scene(folder / site.site.scene, unit=site.site.scene_unit, up=site.site.scene_up)
+    return prepare_scene(site, scene, settings)
 
 
-def prepare_scene(site: SiteFile, scene: Scene) -> Twin:
+def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = None) -> Twin:
     """Check a scene that is loaded already; see :func:`prepare_twin`."""
-    topology = find_topology(scene)
+    settings = settings or TwinSettings()
+    topology = find_topology(scene, weld=settings.weld)
     repeats = find_repeats(scene, topology)
     if repeats.needless.any():
         scene = without(scene, repeats.needless)
-        topology = find_topology(scene)
+        topology = find_topology(scene, weld=settings.weld)
     parts = split_parts(scene, topology)
     stations = np.array([station.position_m for station in site.stations])
-    enclosures = find_enclosures(scene, parts, stations)
+    enclosures = find_enclosures(scene, parts, stations, settings)
     free_space = map_free_space(
         scene,
         solids=[part for part, shell in zip(parts, enclosures.enclosing, strict=True) if part.closed and not shell],
         rooms=[part for part, is_room in zip(parts, enclosures.rooms, strict=True) if is_room],
-        voxel_size=VOXEL_SIZE,
+        voxel_size=settings.voxel_size,
+        max_voxels=settings.max_voxels,
     )
     closed = bool(enclosures.rooms.any())
     if not closed:
@@ -81,14 +83,21 @@ def prepare_scene(site: SiteFile, scene: Scene) -> Twin:
         *size_findings(site, scene),
         *mesh_findings(scene, repeats, parts, enclosures),
         *material_findings(site, scene),
-        *station_findings(site, scene, parts, enclosures),
+        *station_findings(site, scene, parts, enclosures, touch=settings.touch),
     ]
     if not free_space.free.any():
         problem = "the scene has no free space: every voxel lies in a solid or outside"
         findings.append(error("free space", problem, "check for an inverted room"))
+    planes = merge_coplanar(scene.triangles, tolerance=settings.plane_tolerance, rounding=settings.plane_rounding)
     return Twin(
         scene=scene,
-        planes=join_facets(scene.triangles, merge_coplanar(scene.triangles), topology),
+        planes=join_facets(
+            scene.triangles,
+            planes,
+            topology,
+            surface_angle=settings.surface_angle,
+            facet_size=settings.facet_size,
+        ),
         engine=EmbreeEngine(scene.triangles),
         free_space=free_space,
         closed=closed,

@@ -30,7 +30,7 @@ def condition_on_angle(
     Parameters
     ----------
     log_weight, u_mean, u_cov, x_mean, jacobian, x_cov : ndarray
-        The ``tubes`` of a :class:`~rayfix_tables.mixture.TubeMixture`.
+        The ``tubes`` of a :class:`~rayfix_tables.mixture.TubeMixture`. Their covariances are positive definite.
     begins, ends : ndarray of int64, shape (n,)
         Components of cell ``c`` are those from ``begins[c]`` to ``ends[c]``.
     rest_mean : ndarray of shape (n, 2), rad
@@ -43,6 +43,7 @@ def condition_on_angle(
     out_mean : ndarray of shape (k, 4), m
         Mean of (x, path length).
     out_cov : ndarray of shape (k, 4, 4), m2
+        Positive definite: the position of a component given its ray is nowhere exact.
     """
     u = np.empty(3)
     cov = np.empty((3, 3))

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rayfix_offline.fit.em import ExpectationMaximisation, fit_em, sample_points
-from rayfix_offline.fit.moments import CUTOFF, LENGTH_FLOOR, POSITION_FLOOR
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.fit.em import fit_em, sample_points
+from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit, TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_offline.site import parse_site
 from rayfix_tables.angles import direction
@@ -35,7 +35,7 @@ def moments_of_pieces(level: LevelRays, cell: int) -> tuple[NDArray[np.float64],
     turn = rays.azimuth - centre[0]
     turn -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
     square = ((np.sin(centre[1]) * turn) ** 2 + (rays.zenith - centre[1]) ** 2) / level.window**2
-    window = np.where(square <= CUTOFF**2, np.exp(-square / 2.0), 0.0) / (2.0 * np.pi * level.window**2)
+    window = np.where(square <= RayFit.cutoff**2, np.exp(-square / 2.0), 0.0) / (2.0 * np.pi * level.window**2)
     weight = (window * rays.solid_angle)[ray] * pieces.mass
     heading = np.einsum("nij,nj->ni", sequences.mirrors[pieces.sequence], rays.directions[ray])
     place = sequences.images[pieces.sequence] + pieces.mean[:, None] * heading
@@ -70,10 +70,10 @@ def test_points_are_where_their_ray_coordinates_say(level: LevelRays) -> None:
 
 
 def test_the_fit_is_valid(level: LevelRays) -> None:
-    counts, log_mass, mixture = fit_em(level.grid.centres[CELLS], CELLS, level, FEW)
+    counts, log_mass, mixture, _ = fit_em(level.grid.centres[CELLS], CELLS, level, FEW)
     assert set(counts.tolist()) <= {2, 6}
     assert len(mixture) == counts.sum()
-    _, tubes_mass, _ = fit_tubes(level.grid.centres[CELLS], level, TubeFit())
+    _, tubes_mass, _, _ = fit_tubes(level.grid.centres[CELLS], level, TubeFit())
     np.testing.assert_allclose(log_mass, tubes_mass, rtol=0, atol=1e-12)
     ends = np.cumsum(counts)
     for cell, end, count in zip(CELLS, ends, counts, strict=True):
@@ -86,18 +86,18 @@ def test_the_fit_is_valid(level: LevelRays) -> None:
         error = 4.0 * points.std(axis=0) / np.sqrt(FEW.num_points)
         assert np.all(np.abs(found - points.mean(axis=0)) < error)
     u_cov, x_cov = unpack(mixture.u_cov).astype(float), unpack(mixture.x_cov).astype(float)
-    assert np.all(u_cov[:, 0, 0] >= 0.99 * LENGTH_FLOOR**2)
+    assert np.all(u_cov[:, 0, 0] >= 0.99 * RayFit.length_floor**2)
     assert np.linalg.eigvalsh(u_cov).min() > 0.0
-    assert np.linalg.eigvalsh(x_cov).min() > 0.9 * POSITION_FLOOR**2
+    assert np.linalg.eigvalsh(x_cov).min() > 0.9 * RayFit.position_floor**2
     assert set(mixture.num_reflections.tolist()) <= {0, 1}
 
 
 def test_more_components_are_taken_where_they_pay(level: LevelRays) -> None:
     """BIC prefers six to one where rays are direct and mirrored, and one where that is all there is to choose."""
     centres = level.grid.centres[CELLS]
-    chosen, _, _ = fit_em(centres, CELLS, level, ExpectationMaximisation(num_points=1000, num_components=(1, 6)))
+    chosen, _, _, _ = fit_em(centres, CELLS, level, ExpectationMaximisation(num_points=1000, num_components=(1, 6)))
     assert chosen.tolist() == [6, 6, 6]
-    only, _, _ = fit_em(centres, CELLS, level, ExpectationMaximisation(num_points=1000, num_components=(1,)))
+    only, _, _, _ = fit_em(centres, CELLS, level, ExpectationMaximisation(num_points=1000, num_components=(1,)))
     assert only.tolist() == [1, 1, 1]
 
 

@@ -10,14 +10,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rayfix_offline.fit.moments import (
-    CUTOFF,
-    LENGTH_FLOOR,
-    POSITION_FLOOR,
     blur,
     gather_groups,
     gathered_arrays,
     new_rows,
 )
+from rayfix_offline.fit.settings import RayFit
 from rayfix_offline.rays.pathprior import PathPrior
 from rayfix_offline.rays.pieces import Pieces, cut_pieces
 from rayfix_offline.rays.rays import RaySet, sample_rays
@@ -26,6 +24,7 @@ from rayfix_tables.angles import direction, tangent
 from tests.support.rays import no_reflections
 
 Launch = Callable[..., Segments]
+FLOORS = (RayFit.length_floor, RayFit.position_floor)
 Groups = dict[tuple[int, int], tuple[float, NDArray[np.float64], NDArray[np.float64]]]
 
 
@@ -54,6 +53,7 @@ def gather(traced: Traced, centre: tuple[float, float], window: float, rows: NDA
     sequence, slices, mass, mean, cov = gather_groups(
         *centre,
         window,
+        RayFit.cutoff,
         *gathered_arrays(rays, pieces, traced.sequences),
         pieces.num_slices,
         new_rows(len(traced.sequences.images)) if rows is None else rows,
@@ -68,7 +68,7 @@ def naive_groups(traced: Traced, centre: tuple[float, float], window: float) -> 
     at = tangent(rays.azimuth, rays.zenith, *centre)
     square = (at**2).sum(axis=1) / window**2
     density = np.exp(-square / 2.0) / (2.0 * np.pi * window**2) * rays.solid_angle
-    density[square > CUTOFF**2] = 0.0
+    density[square > RayFit.cutoff**2] = 0.0
     ray = np.repeat(np.arange(len(rays)), np.diff(pieces.offsets))
     weight = density[ray] * pieces.mass
     heading = np.einsum("nij,nj->ni", traced.sequences.mirrors[pieces.sequence], rays.directions[ray])
@@ -152,10 +152,10 @@ def test_the_mass_is_the_integral_of_the_window(window: float) -> None:
     )
     centre = (0.4, 1.2)
     ((mass, mean, cov),) = gather(Traced(rays, pieces, no_reflections()), centre, window).values()
-    inside = 1.0 - np.exp(-(CUTOFF**2) / 2.0)
+    inside = 1.0 - np.exp(-(RayFit.cutoff**2) / 2.0)
     assert mass == pytest.approx(inside * np.exp(-(window**2) / 2.0), rel=0.01)
     # Of a Gaussian cut at radius c, the variance along either axis shrinks by c^2 / 2 exp(-c^2 / 2) / inside.
-    variance = window**2 * (1.0 - CUTOFF**2 / 2.0 * np.exp(-(CUTOFF**2) / 2.0) / inside)
+    variance = window**2 * (1.0 - RayFit.cutoff**2 / 2.0 * np.exp(-(RayFit.cutoff**2) / 2.0) / inside)
     np.testing.assert_allclose(cov[1:3, 1:3] / variance, np.eye(2), rtol=0, atol=0.04)
     # The chart's slope shifts the vertical mean by cot(zenith) variance.
     np.testing.assert_allclose(mean[:3], (2.0, 0.0, variance / np.tan(1.2)), rtol=0, atol=0.02 * window)
@@ -185,7 +185,7 @@ def test_blur_adds_the_width_of_a_ray(seed: int) -> None:
     before = root @ root.T
     after = before.copy()
     spacing = rng.uniform(0.005, 0.1)
-    blur(mean, after, mirror, *centre, spacing)
+    blur(mean, after, mirror, *centre, spacing, *FLOORS)
     step = 1e-6
     slope = np.array(
         [
@@ -194,8 +194,8 @@ def test_blur_adds_the_width_of_a_ray(seed: int) -> None:
         ]
     ).T
     gradient = np.concatenate([np.eye(3), slope])
-    widths = np.array([LENGTH_FLOOR, spacing / np.sqrt(12.0), spacing / np.sqrt(12.0)])
-    expected = (gradient * widths**2) @ gradient.T + np.diag([0, 0, 0, 1, 1, 1]) * POSITION_FLOOR**2
+    widths = np.array([RayFit.length_floor, spacing / np.sqrt(12.0), spacing / np.sqrt(12.0)])
+    expected = (gradient * widths**2) @ gradient.T + np.diag([0, 0, 0, 1, 1, 1]) * RayFit.position_floor**2
     np.testing.assert_allclose(after - before, expected, rtol=0, atol=1e-7)
     np.testing.assert_allclose(after, after.T, rtol=1e-14, atol=1e-16)
 
@@ -207,10 +207,12 @@ def test_blur_makes_a_point_a_tube(seed: int, zenith: float, horizontal: float, 
     rng = np.random.default_rng(seed)
     mean = np.array([rng.uniform(0.1, 60.0), horizontal, vertical, 0.0, 0.0, 0.0])
     cov = np.zeros((6, 6))
-    blur(mean, cov, np.eye(3), rng.uniform(-3, 3), zenith, 0.01)
+    blur(mean, cov, np.eye(3), rng.uniform(-3, 3), zenith, 0.01, *FLOORS)
     scale = np.sqrt(np.diag(cov))
     assert np.linalg.eigvalsh(cov / np.outer(scale, scale)).min() > 1e-9
-    assert np.all(scale[3:] >= POSITION_FLOOR)
+    assert np.all(scale[3:] >= RayFit.position_floor)
     # Across the tube, given the ray coordinates, only the floor is left.
     rest = cov[3:, 3:] - cov[3:, :3] @ np.linalg.solve(cov[:3, :3], cov[:3, 3:])
-    np.testing.assert_allclose(rest, POSITION_FLOOR**2 * np.eye(3), rtol=0, atol=1e-6 * scale[3:].max() ** 2 + 1e-12)
+    np.testing.assert_allclose(
+        rest, RayFit.position_floor**2 * np.eye(3), rtol=0, atol=1e-6 * scale[3:].max() ** 2 + 1e-12
+    )

@@ -11,6 +11,7 @@ from scipy.stats import norm
 
 from rayfix_offline.fit.cells import assemble_level, fit_cells
 from rayfix_offline.fit.normalise import balanced
+from rayfix_offline.fit.settings import TubeFit
 from rayfix_offline.site import parse_site
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
@@ -110,7 +111,7 @@ def room(
     folder = tmp_path_factory.mktemp("room")
     site = parse_site(site_document(propagation={"max_reflections": 2}, table={"windows_deg": [5.0]}))
     rays = finest_level(folder, scene_of_boxes(room=ROOM, cabinet=CABINET, table=TABLE), site)
-    level = assemble_level(rays.window, rays.grid, [fit_cells(np.arange(rays.grid.num_cells), rays, site)])
+    level = assemble_level(rays.window, rays.grid, [fit_cells(np.arange(rays.grid.num_cells), rays, TubeFit())])
     free = np.ones((40, 50, 30), bool)
     for low, high in (CABINET, TABLE):
         (x0, y0, z0), (x1, y1, z1) = (np.round(10.0 * np.array(corner)).astype(int) for corner in (low, high))
@@ -134,3 +135,15 @@ def test_shares_of_a_room_come_closer_to_one(room: tuple[Level, FreeSpace]) -> N
     low, high = (np.average(share[heard & walls], weights=volume[heard & walls]) for share in (before, after))
     assert low < 0.85
     assert low + 0.1 < high < 1.1
+
+
+def test_a_component_without_a_covariance_keeps_its_weight() -> None:
+    """Written by other software into a table, it made the whole normalisation fail with a LinAlgError."""
+    level = level_of(np.array([[4.0, 4.0, 4.0], [0.5, 4.0, 4.0]]), np.array([0.3, 0.3]), log_mass=3.0)
+    alone = level_of(np.array([[4.0, 4.0, 4.0]]), np.array([0.3]), log_mass=3.0 - np.log(2.0))
+    x_cov = level.mixture.x_cov.copy()
+    x_cov[1] = pack(-np.eye(3))
+    broken = replace(level, mixture=replace(level.mixture, x_cov=x_cov))
+    found = balanced(broken, open_space()).log_balance
+    assert found[1] == 0.0
+    assert found[0] == pytest.approx(balanced(alone, open_space()).log_balance[0], abs=1e-6)

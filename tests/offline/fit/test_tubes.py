@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_offline.fit.em import ExpectationMaximisation, fit_em, sample_points
-from rayfix_offline.fit.moments import CUTOFF, POSITION_FLOOR
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.fit.em import fit_em, sample_points
+from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit, TubeFit
+from rayfix_offline.fit.tubes import Fitted, fit_tubes, fitted_cells
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_offline.site import parse_site
 from rayfix_tables.angles import direction, tangent
@@ -20,7 +22,7 @@ from tests.support.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_box
 
 Array = NDArray[np.float64]
 STATION = np.array([3.6, 0.4, 2.6])
-INSIDE = 1.0 - np.exp(-(CUTOFF**2) / 2.0)  # share of a cell's window within its cut-off
+INSIDE = 1.0 - np.exp(-(RayFit.cutoff**2) / 2.0)  # share of a cell's window within its cut-off
 
 
 @pytest.fixture(scope="module")
@@ -101,10 +103,10 @@ def test_the_mass_of_each_cell_is_its_integral(empty_level: LevelRays) -> None:
     """
     level = empty_level
     cells = np.arange(1, level.grid.num_cells, 11)
-    _, log_mass, _ = fit_tubes(level.grid.centres[cells], level, TubeFit())
-    nodes = np.linspace(-CUTOFF, CUTOFF, 121)
+    _, log_mass, _, _ = fit_tubes(level.grid.centres[cells], level, TubeFit())
+    nodes = np.linspace(-RayFit.cutoff, RayFit.cutoff, 121)
     h, v = np.meshgrid(nodes, nodes, indexing="ij")
-    disc = h**2 + v**2 <= CUTOFF**2
+    disc = h**2 + v**2 <= RayFit.cutoff**2
     window = np.exp(-(h**2 + v**2) / 2.0)[disc] / (2.0 * np.pi) * (nodes[1] - nodes[0]) ** 2
     ratio = []
     for cell, found in zip(cells, log_mass, strict=True):
@@ -123,7 +125,7 @@ def test_the_mass_of_each_cell_is_its_integral(empty_level: LevelRays) -> None:
 def test_all_masses_add_up_to_the_volume(empty_level: LevelRays) -> None:
     """Windows around all cells cover each direction alike, so s^2 ds dOmega adds up to the room, 60 m3."""
     level = empty_level
-    _, log_mass, _ = fit_tubes(level.grid.centres, level, TubeFit())
+    _, log_mass, _, _ = fit_tubes(level.grid.centres, level, TubeFit())
     solid_angle = np.repeat(level.grid.solid_angles, level.grid.ring_cells)
     # The window's integral over the sphere is exp(-window^2 / 2) of one, as in the chart.
     assert np.sum(np.exp(log_mass) * solid_angle) == pytest.approx(60.0 * INSIDE, rel=0.01)
@@ -136,7 +138,7 @@ def test_places_lie_in_the_direction_of_their_angles(empty_level: LevelRays) -> 
     """
     level = empty_level
     cells = np.arange(3, level.grid.num_cells, 41)
-    counts, _, mixture = fit_tubes(level.grid.centres[cells], level, TubeFit())
+    counts, _, mixture, _ = fit_tubes(level.grid.centres[cells], level, TubeFit())
     for centre, cell in zip(level.grid.centres[cells], cells_of(mixture, counts), strict=True):
         for k in range(len(cell)):
             mean = cell.u_mean[k].astype(float)
@@ -153,7 +155,7 @@ def test_places_lie_in_the_direction_of_their_angles(empty_level: LevelRays) -> 
 
 
 def test_no_place_is_outside_the_room(empty_level: LevelRays) -> None:
-    _, _, mixture = fit_tubes(empty_level.grid.centres, empty_level, TubeFit())
+    _, _, mixture, _ = fit_tubes(empty_level.grid.centres, empty_level, TubeFit())
     assert np.all(mixture.x_mean > -0.01)
     assert np.all(mixture.x_mean < np.array([4.01, 5.01, 3.01]))
 
@@ -162,13 +164,13 @@ def test_no_place_is_outside_the_room(empty_level: LevelRays) -> None:
 
 
 @pytest.fixture(scope="module")
-def fitted(cluttered_level: LevelRays) -> tuple[NDArray[np.int64], Array, TubeMixture]:
+def fitted(cluttered_level: LevelRays) -> Fitted:
     """All cells of the cluttered room."""
     return fit_tubes(cluttered_level.grid.centres, cluttered_level, TubeFit())
 
 
-def test_mixtures_are_valid(cluttered_level: LevelRays, fitted: tuple[NDArray[np.int64], Array, TubeMixture]) -> None:
-    counts, log_mass, mixture = fitted
+def test_mixtures_are_valid(cluttered_level: LevelRays, fitted: Fitted) -> None:
+    counts, log_mass, mixture, _ = fitted
     assert np.all((counts >= 1) & (counts <= TubeFit().max_components))
     assert np.all(np.isfinite(log_mass))
     for cell in cells_of(mixture, counts):
@@ -177,16 +179,14 @@ def test_mixtures_are_valid(cluttered_level: LevelRays, fitted: tuple[NDArray[np
     scale = np.sqrt(np.einsum("nii->ni", u_cov))
     assert np.linalg.eigvalsh(u_cov / (scale[:, :, None] * scale[:, None, :])).min() > 1e-6
     # Given the ray coordinates, at least the floor is left; single precision takes a part in 1e6 of the largest.
-    assert np.linalg.eigvalsh(x_cov).min() > 0.9 * POSITION_FLOOR**2
+    assert np.linalg.eigvalsh(x_cov).min() > 0.9 * RayFit.position_floor**2
     assert set(mixture.num_reflections.tolist()) == {0, 1, 2}
     assert all(np.isfinite(getattr(mixture, name)).all() for name in ("x_mean", "jacobian", "u_mean"))
 
 
-def test_the_fit_keeps_the_moments_of_the_rays(
-    cluttered_level: LevelRays, fitted: tuple[NDArray[np.int64], Array, TubeMixture]
-) -> None:
+def test_the_fit_keeps_the_moments_of_the_rays(cluttered_level: LevelRays, fitted: Fitted) -> None:
     """Merging keeps mean and covariance, so they are those of the pieces but for blur and the dropped mass of 1e-4."""
-    level, (counts, log_mass, mixture) = cluttered_level, fitted
+    level, (counts, log_mass, mixture, _) = cluttered_level, fitted
     rays, pieces, sequences = level.rays, level.pieces, level.sequences
     ray = np.repeat(np.arange(len(rays)), np.diff(pieces.offsets))
     heading = np.einsum("nij,nj->ni", sequences.mirrors[pieces.sequence], rays.directions[ray])
@@ -196,7 +196,7 @@ def test_the_fit_keeps_the_moments_of_the_rays(
     for cell in range(10, len(cells), 100):
         at = tangent(rays.azimuth, rays.zenith, *level.grid.centres[cell])
         square = (at**2).sum(axis=1) / level.window**2
-        window = np.where(square <= CUTOFF**2, np.exp(-square / 2.0), 0.0) / (2.0 * np.pi * level.window**2)
+        window = np.where(square <= RayFit.cutoff**2, np.exp(-square / 2.0), 0.0) / (2.0 * np.pi * level.window**2)
         weight = (window * rays.solid_angle)[ray] * pieces.mass
         points = np.concatenate([pieces.mean[:, None], at[ray], place], axis=1)
         mean = weight @ points / weight.sum()
@@ -214,12 +214,10 @@ def test_the_fit_keeps_the_moments_of_the_rays(
         assert gap[3:, 3:].max() < 0.05**2 + (8.0 * level.ray_spacing) ** 2 / 12.0
 
 
-def test_cells_do_not_know_of_each_other(
-    cluttered_level: LevelRays, fitted: tuple[NDArray[np.int64], Array, TubeMixture]
-) -> None:
-    counts, log_mass, mixture = fitted
+def test_cells_do_not_know_of_each_other(cluttered_level: LevelRays, fitted: Fitted) -> None:
+    counts, log_mass, mixture, _ = fitted
     cells = np.array([700, 3, 411])
-    some, its_mass, parts = fit_tubes(cluttered_level.grid.centres[cells], cluttered_level, TubeFit())
+    some, its_mass, parts, _ = fit_tubes(cluttered_level.grid.centres[cells], cluttered_level, TubeFit())
     np.testing.assert_array_equal(some, counts[cells])
     np.testing.assert_array_equal(its_mass, log_mass[cells])
     whole = cells_of(mixture, counts)
@@ -232,8 +230,8 @@ def test_cells_do_not_know_of_each_other(
 def test_few_components(cluttered_level: LevelRays, most: int) -> None:
     """Down to one Gaussian of the cell's moments."""
     centres = cluttered_level.grid.centres[[500, 777]]
-    many, _, parts = fit_tubes(centres, cluttered_level, TubeFit())
-    few, _, merged = fit_tubes(centres, cluttered_level, TubeFit(max_components=most))
+    many, _, parts, _ = fit_tubes(centres, cluttered_level, TubeFit())
+    few, _, merged, _ = fit_tubes(centres, cluttered_level, TubeFit(max_components=most))
     assert few.tolist() == [most, most] < many.tolist()
     for before, after in zip(cells_of(parts, many), cells_of(merged, few), strict=True):
         for mine, theirs in zip(overall(*joint(after)), overall(*joint(before)), strict=True):
@@ -244,7 +242,7 @@ def test_rays_that_weigh_nothing_leave_empty_cells(cluttered_level: LevelRays) -
     pieces = replace(cluttered_level.pieces, mass=np.zeros_like(cluttered_level.pieces.mass))
     level = replace(cluttered_level, pieces=pieces)
     centres, cells = level.grid.centres[:3], np.arange(3)
-    for counts, log_mass, mixture in (
+    for counts, log_mass, mixture, _ in (
         fit_tubes(centres, level, TubeFit()),
         fit_em(centres, cells, level, ExpectationMaximisation()),
     ):
@@ -256,8 +254,8 @@ def test_rays_that_weigh_nothing_leave_empty_cells(cluttered_level: LevelRays) -
 def held_out_gain(level: LevelRays, cells: NDArray[np.int64]) -> Array:
     """By how much tubes explain points that neither fit has seen better than EM, nats a point, for each cell."""
     centres = level.grid.centres[cells]
-    counts, _, tubes = fit_tubes(centres, level, TubeFit())
-    em_counts, _, em = fit_em(centres, cells, level, ExpectationMaximisation(seed=1))
+    counts, _, tubes, _ = fit_tubes(centres, level, TubeFit())
+    em_counts, _, em, _ = fit_em(centres, cells, level, ExpectationMaximisation(seed=1))
     gain = []
     for n, (mine, theirs) in enumerate(zip(cells_of(tubes, counts), cells_of(em, em_counts), strict=True)):
         points, _, _ = sample_points(centres[n], level, 4000, np.random.default_rng([99, cells[n]]))
@@ -279,3 +277,55 @@ def test_tubes_are_within_a_nat_of_em_in_the_mean_of_many_cells(cluttered_level:
     gain = held_out_gain(cluttered_level, cells)
     assert gain.mean() + 2.0 * gain.std() / np.sqrt(len(gain)) > -1.0
     assert gain.mean() > -1.0
+
+
+def joint_moments(variance: Array) -> tuple[Array, Array]:
+    """Means and covariances of components of these variances of the path length, m2, all else being independent."""
+    mean = np.tile([5.0, 0.0, 0.0, 1.0, 2.0, 3.0], (len(variance), 1))
+    cov = np.tile(np.diag([1.0, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4]), (len(variance), 1, 1))
+    cov[:, 0, 0] = variance
+    return mean, cov
+
+
+def as_cells(counts: list[int], weight: Array, variance: Array) -> Fitted:
+    """Turn components of cells of mass 1 into mixtures."""
+    mean, cov = joint_moments(variance)
+    log_mass, reflections = np.zeros(len(counts)), np.zeros(len(weight), np.int8)
+    return fitted_cells(np.array(counts), log_mass, np.log(weight), mean, cov, reflections, position_floor=0.002)
+
+
+@pytest.mark.parametrize("variance", [0.0, -1.0, np.nan, np.inf])
+def test_a_component_without_a_covariance_is_dropped_with_its_weight(variance: float) -> None:
+    """It made the whole build fail with a LinAlgError, or went into the table."""
+    counts, log_mass, mixture, dropped = as_cells(
+        [2, 3], np.array([0.5, 0.5, 0.2, 0.3, 0.5]), np.array([1.0, 1.0, 1.0, variance, 1.0])
+    )
+    assert counts.tolist() == [2, 2]
+    assert dropped.tolist() == [0, 1]
+    np.testing.assert_allclose(log_mass, [0.0, np.log(0.7)], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(np.exp(mixture.log_weight), [0.5, 0.5, 2 / 7, 5 / 7], rtol=1e-6)
+
+
+def test_a_cell_without_any_covariance_is_empty() -> None:
+    counts, log_mass, mixture, dropped = as_cells([1, 1], np.array([1.0, 1.0]), np.array([1.0, -1.0]))
+    assert (counts.tolist(), dropped.tolist()) == ([1, 0], [0, 1])
+    assert log_mass.tolist() == [0.0, -np.inf]
+    assert len(mixture) == 1
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_covariances_are_definite_as_the_table_holds_them(seed: int) -> None:
+    """Thin and long components in all directions; in single precision many of them were singular."""
+    rng = np.random.default_rng(seed)
+    root = np.linalg.qr(rng.normal(size=(20, 6, 6)))[0] * 10.0 ** rng.uniform(-3.5, 2.0, (20, 1, 6))
+    cov = root @ root.transpose(0, 2, 1)
+    mean = np.abs(rng.normal(size=(20, 6))) + 1.0
+    log_weight = np.full(20, -np.log(20.0))
+    found = fitted_cells(
+        np.array([20]), np.zeros(1), log_weight, mean, cov, np.zeros(20, np.int8), position_floor=0.002
+    )
+    assert found.counts[0] + found.dropped[0] == 20
+    assert len(found.mixture) > 15
+    for packed in (found.mixture.u_cov, found.mixture.x_cov):
+        np.linalg.cholesky(unpack(packed.astype(np.float64)))

@@ -13,8 +13,9 @@ from scipy.special import logsumexp
 
 from rayfix_offline.fit.cells import assemble_level, fit_cells
 from rayfix_offline.fit.em import sample_points
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
-from rayfix_offline.fit.wide_windows import CoarseFit, sum_cells
+from rayfix_offline.fit.settings import CoarseFit, TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
+from rayfix_offline.fit.wide_windows import sum_cells
 from rayfix_offline.rays.trace import LevelRays, trace_station
 from rayfix_offline.site import parse_site
 from rayfix_offline.twin.twin import prepare_twin
@@ -36,7 +37,7 @@ def fine(
     site = parse_site(site_document(propagation={"max_reflections": 2}, table={"windows_deg": [3.0]}))
     rays = finest_level(tmp_path_factory.mktemp("room"), scene, site)
     cells = np.arange(rays.grid.num_cells)
-    return rays, assemble_level(rays.window, rays.grid, [fit_cells(cells, rays, site)])
+    return rays, assemble_level(rays.window, rays.grid, [fit_cells(cells, rays, TubeFit())])
 
 
 def wide_cells(level: Level, fit: CoarseFit) -> list[tuple[float, TubeMixture]]:
@@ -87,7 +88,7 @@ def test_merging_costs_little_of_what_measurements_see(fine: tuple[LevelRays, Le
     wide = replace(rays, window=WIDE)
     angle = rays.window / WINDOW_RATIO
     variances = np.array([0.1**2, angle**2, angle**2, 0.0, 0.0, 0.0])
-    counts, _, wide_fit = fit_tubes(CENTRES, wide, TubeFit())
+    counts, _, wide_fit, _ = fit_tubes(CENTRES, wide, TubeFit())
     direct = np.split(np.arange(len(wide_fit)), np.cumsum(counts)[:-1])
     kept = wide_cells(level, CoarseFit(max_divergence=0.0))
     losses, gains = [], []
@@ -138,7 +139,7 @@ def test_a_site_of_two_windows(tmp_path: Path, site_document: Callable[..., dict
     (tmp_path / "room.glb").write_bytes(scene.export(file_type="glb"))
     site = parse_site(site_document(table={"windows_deg": [8.0]}))
     rays = trace_station(site.stations[0], site, prepare_twin(site, tmp_path)).finest
-    level = assemble_level(rays.window, rays.grid, [fit_cells(np.arange(rays.grid.num_cells), rays, site)])
+    level = assemble_level(rays.window, rays.grid, [fit_cells(np.arange(rays.grid.num_cells), rays, TubeFit())])
     grid = type(rays.grid).from_spacing(np.deg2rad(20.0))
     summed = sum_cells(grid.centres, np.deg2rad(16.0), level, np.zeros(level.num_cells, np.float32), CoarseFit())
     assert np.all(np.isfinite(summed.log_mass))

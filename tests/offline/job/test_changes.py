@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rayfix_offline.fit.moments import CUTOFF
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.fit.settings import RayFit, TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.job.changes import SMALLEST, cell_changes, ray_changes
 from rayfix_offline.rays.pathprior import fill_path_prior
 from rayfix_offline.rays.pieces import cut_pieces
@@ -70,7 +70,7 @@ def rays_of(level: LevelRays, cell: int) -> tuple[NDArray[np.int64], NDArray[np.
     rays: RaySet = level.rays
     at = tangent(rays.azimuth, rays.zenith, *level.grid.centres[cell])
     square = (at**2).sum(axis=1) / level.window**2
-    inside = np.flatnonzero(square <= CUTOFF**2)
+    inside = np.flatnonzero(square <= RayFit.cutoff**2)
     return inside, np.exp(-0.5 * square[inside]) * rays.solid_angle[inside]
 
 

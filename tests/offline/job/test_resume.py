@@ -13,6 +13,7 @@ import pytest
 
 from rayfix_offline import build
 from rayfix_offline.build import BuildSummary, build_table
+from rayfix_offline.job import plan
 from rayfix_offline.job.shards import ShardStore
 from rayfix_tables.errors import BuildError
 from rayfix_tables.site import NO_BIAS
@@ -98,6 +99,16 @@ def test_a_damaged_shard_is_built_again(damage: str, tmp_path: Path, whole: Buil
         if damage == "flip":
             content[len(content) // 2] ^= 1
         shard.write_bytes({"flip": content, "cut": content[: len(content) // 2], "empty": b""}[damage])
+    assert build_table(site, table, jobs=1).table_id == whole.table_id
+
+
+def test_a_shard_of_blocks_of_another_size_is_not_taken(
+    tmp_path: Path, whole: BuildSummary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Shards are named by their block's number, which stands for other cells when blocks are smaller."""
+    site, table = write_site(tmp_path, STATIONS), tmp_path / "t.h5"
+    interrupt_after(1500, site, table)
+    monkeypatch.setattr(plan, "BLOCK_CELLS", 100)
     assert build_table(site, table, jobs=1).table_id == whole.table_id
 
 
@@ -194,14 +205,14 @@ def test_a_balance_is_kept_with_its_part_and_made_where_there_is_none(
 ) -> None:
     site, table = write_site(tmp_path, STATIONS), tmp_path / "t.h5"
     with monkeypatch.context() as early:
-        early.setattr(build, "balanced", lambda level, free_space: level)  # as the first tables were
+        early.setattr(build, "balanced", lambda level, free_space, settings: level)  # as the first tables were
         unbalanced = build_table(site, table, jobs=1)
     assert unbalanced.table_id != whole.table_id
     again = build_table(site, table, jobs=1)
     assert set(origins(again).values()) == {"kept"}
     assert again.table_id == whole.table_id
     with monkeypatch.context() as idle:
-        idle.setattr(build, "balanced", lambda level, free_space: pytest.fail("balanced anew"))
+        idle.setattr(build, "balanced", lambda level, free_space, settings: pytest.fail("balanced anew"))
         assert build_table(site, table, jobs=1).table_id == whole.table_id
 
 

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rayfix_offline.rays.pathprior import PathPrior, fill_path_prior
-from rayfix_offline.rays.pieces import FIRST_NODE, Pieces, cut_pieces
+from rayfix_offline.rays.pieces import Pieces, cut_pieces
 from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments
+from rayfix_offline.rays.settings import RaySettings
 from rayfix_tables.freespace import FreeSpace
 from tests.support.rays import no_reflections
 
@@ -101,7 +102,7 @@ def test_the_voxel_of_the_point_decides(rays: RaySet, segments: Segments, axis: 
 def test_moments_of_each_piece(rays: RaySet, segments: Segments, kind: Kind) -> None:
     """Against a fine quadrature with hats that are interpolated between nodes at 0.25 m x 1.35^n."""
     pieces = cut_pieces(rays, segments, prior_of(1.0), exponent=1.0, kind=kind, slice_ratio=RATIO)
-    nodes = FIRST_NODE * RATIO ** np.arange(25)
+    nodes = RaySettings.first_node * RATIO ** np.arange(25)
     for ray in range(0, len(rays), 15):
         mine = slice(pieces.offsets[ray], pieces.offsets[ray + 1])
         found = {
@@ -141,7 +142,7 @@ def test_pieces_lie_within_their_slice_and_their_segment(rays: RaySet, segments:
     assert np.all(pieces.variance >= 0.0)
     used = pieces.mass > 0.0
     assert used.mean() > 0.5
-    node = FIRST_NODE * RATIO ** pieces.slice.astype(float)
+    node = RaySettings.first_node * RATIO ** pieces.slice.astype(float)
     low, high = np.where(pieces.slice == 0, 0.0, node / RATIO), node * RATIO
     assert np.all((pieces.mean > low - 1e-9)[used])
     assert np.all((pieces.mean < high + 1e-9)[used])

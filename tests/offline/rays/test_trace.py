@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rayfix_offline.rays.settings import RaySettings
 from rayfix_offline.rays.trace import (
-    PRIOR_RAYS,
-    PRIOR_SPACING,
-    RAYS_PER_WINDOW,
     StationTrace,
     prior_spacing,
     trace_station,
@@ -36,7 +34,7 @@ def test_cells_have_the_rays_that_their_window_needs(
     trace: Callable[..., tuple[StationTrace, Twin]], window: float
 ) -> None:
     level = trace(window)[0].finest
-    assert level.ray_spacing == pytest.approx(np.deg2rad(window) / RAYS_PER_WINDOW)
+    assert level.ray_spacing == pytest.approx(np.deg2rad(window) / RaySettings.rays_per_window)
     assert level.rays.solid_angle.sum() == pytest.approx(4.0 * np.pi)
     assert len(level.rays) == pytest.approx(4.0 * np.pi / level.ray_spacing**2, rel=0.1)
 
@@ -52,5 +50,5 @@ def test_rays_for_the_path_prior_meet_every_voxel(trace: Callable[..., tuple[Sta
     """The room's diagonal is 7.1 m, the map's voxels measure 0.2 m."""
     _, twin = trace(10.0)
     spacing = prior_spacing(twin)
-    assert spacing * np.sqrt(4.0**2 + 5.0**2 + 3.0**2) == pytest.approx(PRIOR_RAYS * 0.2)
-    assert PRIOR_SPACING < spacing < np.deg2rad(1.2)
+    assert spacing * np.sqrt(4.0**2 + 5.0**2 + 3.0**2) == pytest.approx(RaySettings.prior_rays * 0.2)
+    assert RaySettings.prior_spacing < spacing < np.deg2rad(1.2)

@@ -20,7 +20,7 @@ from rayfix_offline.rays.segments import Segments
 from rayfix_offline.rays.trace import reflectivity_of
 from rayfix_offline.scene.materials import (
     ITU_MATERIALS,
-    LEAST_POWER,
+    ReflectionSettings,
     Reflectivity,
     complex_permittivity,
     constant_reflectivity,
@@ -192,7 +192,7 @@ def test_no_materials_at_all() -> None:
 
 def test_vacuum_leaves_a_little() -> None:
     reflectivity = itu_reflectivity(np.zeros(1, np.int16), ("itu_vacuum",), carrier_ghz=3.5, loss_db=6.0)
-    assert reflectivity.log_gain(np.zeros(1, np.int32), np.array([0.7])) == np.log10(LEAST_POWER)
+    assert reflectivity.log_gain(np.zeros(1, np.int32), np.array([0.7])) == np.log10(ReflectionSettings.least_power)
 
 
 # Launched rays

@@ -8,7 +8,8 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from rayfix_offline.fit.tubes import TubeFit, fit_tubes
+from rayfix_offline.fit.settings import TubeFit
+from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.rays.segments import Sequences
 from rayfix_offline.rays.trace import LevelRays, trace_station
 from rayfix_offline.site import parse_site

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rayfix_offline.twin.planes import TOLERANCE, Planes, merge_coplanar
+from rayfix_offline.twin.planes import Planes, merge_coplanar
+from rayfix_offline.twin.settings import TwinSettings
 from tests.support.shapes import box, cut_in_three, quad
 
 EXACT = 1e-12  # m, of coordinates of a few metres
@@ -89,7 +90,7 @@ def test_a_stack_of_sheets_is_no_mirror(turned: bool) -> None:
         sheets = [sheet[:, ::-1] if n % 3 else sheet for n, sheet in enumerate(sheets)]
     triangles = np.concatenate([*sheets, square(0, 0, 5.0, size=20.0)])
     planes = merge_coplanar(triangles)
-    assert_on_planes(triangles, planes, atol=TOLERANCE)
+    assert_on_planes(triangles, planes, atol=TwinSettings.plane_tolerance)
     assert 100 <= len(planes) <= 201
 
 
@@ -99,7 +100,7 @@ def test_merged_planes_are_their_mean_by_area() -> None:
     planes = merge_coplanar(triangles)
     assert len(planes) == 1
     assert abs(planes.offsets[0]) == pytest.approx(0.0002, abs=1e-12)
-    assert_on_planes(triangles, planes, atol=TOLERANCE)
+    assert_on_planes(triangles, planes, atol=TwinSettings.plane_tolerance)
 
 
 def test_two_boxes_share_only_what_is_coplanar() -> None:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rayfix_offline.scene.scene import Scene
-from rayfix_offline.twin import solids
 from rayfix_offline.twin.enclosures import find_enclosures
+from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.solids import Part, is_inside, map_free_space, split_parts, touched
 from rayfix_offline.twin.topology import find_topology
 from rayfix_tables.freespace import FreeSpace
@@ -170,8 +170,8 @@ def test_touching_a_box(seed: int) -> None:
     axis, sign = rng.integers(0, 3, 20), rng.choice([-1.0, 1.0], 20)
     off = rng.choice([-0.003, -0.0011, -0.0009, 0.0, 0.0009, 0.0011, 0.003], 20)
     local[np.arange(20), axis] = sign * (size[axis] / 2 + off)
-    expected = np.abs(off) < solids.TOUCH
-    expected[off < 0] |= (size / 2 - np.abs(local)).min(axis=1)[off < 0] < solids.TOUCH
+    expected = np.abs(off) < TwinSettings.touch
+    expected[off < 0] |= (size / 2 - np.abs(local)).min(axis=1)[off < 0] < TwinSettings.touch
     found = [touched(triangles, point) >= 0 for point in rotation.apply(local) + shift]
     assert found == expected.tolist()
 
@@ -229,7 +229,9 @@ def test_an_open_room_encloses_nothing(clutter: NDArray[np.float64]) -> None:
 # Free space
 
 
-def mapped(scene: Scene, enclosing: list[bool], voxel_size: float) -> FreeSpace:
+def mapped(
+    scene: Scene, enclosing: list[bool], voxel_size: float, max_voxels: int = TwinSettings.max_voxels
+) -> FreeSpace:
     """Map the free space of a scene, its parts as rooms or solids."""
     parts = [(part, encloses) for part, encloses in zip(parts_of(scene), enclosing, strict=True) if part.closed]
     return map_free_space(
@@ -237,6 +239,7 @@ def mapped(scene: Scene, enclosing: list[bool], voxel_size: float) -> FreeSpace:
         solids=[part for part, encloses in parts if not encloses],
         rooms=[part for part, encloses in parts if encloses],
         voxel_size=voxel_size,
+        max_voxels=max_voxels,
     )
 
 
@@ -313,10 +316,9 @@ def test_an_open_part_is_not_solid(clutter: NDArray[np.float64]) -> None:
     assert free.all()
 
 
-def test_a_large_scene_gets_larger_voxels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(solids, "MAX_VOXELS", 10_000)
+def test_a_large_scene_gets_larger_voxels() -> None:
     scene = scene_of(hall=box((0, 0, 0), (80, 180, 25)))
-    space = mapped(scene, [True], 0.1)
+    space = mapped(scene, [True], 0.1, max_voxels=10_000)
     assert space.free.size <= 10_000 * 1.5  # every axis is rounded up
     assert space.voxel_size == pytest.approx((80 * 180 * 25 / 10_000) ** (1 / 3), rel=1e-12)
     # Voxels that reach beyond the hall count where their centre lies within.

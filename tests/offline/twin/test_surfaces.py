@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from rayfix_offline.twin.planes import Planes, merge_coplanar
-from rayfix_offline.twin.surfaces import FACET_SIZE, SURFACE_ANGLE, join_facets
+from rayfix_offline.twin.settings import TwinSettings
+from rayfix_offline.twin.surfaces import join_facets
 from rayfix_offline.twin.topology import find_topology, number_rows
 from tests.support.rooms import scene_of
 from tests.support.shapes import box
@@ -60,7 +61,7 @@ def test_a_pillar_has_few_surfaces_however_many_facets(sections: int) -> None:
     before, planes = joined(triangles)
     assert len(before) == sections + 2
     side = planes.surfaces[planes.face_planes[side_of(triangles)]]
-    full_turn = 360.0 / np.rad2deg(SURFACE_ANGLE)
+    full_turn = 360.0 / np.rad2deg(TwinSettings.surface_angle)
     assert full_turn / 2 <= len(np.unique(side)) <= full_turn
     # The mirrors are those of the facets: nothing is rounded.
     np.testing.assert_array_equal(planes.normals[planes.face_planes], before.normals[before.face_planes])
@@ -75,7 +76,7 @@ def test_a_surface_turns_by_twice_its_angle_at_most(sections: int) -> None:
     for n in np.unique(surface[side_of(triangles)]):
         azimuth = np.arctan2(middle[surface == n, 1], middle[surface == n, 0])
         turn = np.angle(np.exp(1j * (azimuth[:, None] - azimuth))).max()
-        assert turn <= 2.0 * SURFACE_ANGLE + 2.0 * np.pi / sections
+        assert turn <= 2.0 * TwinSettings.surface_angle + 2.0 * np.pi / sections
 
 
 def test_the_ends_of_a_pillar_are_surfaces_by_themselves() -> None:
@@ -102,13 +103,13 @@ def test_a_ball() -> None:
     """1,280 facets; caps of 20 deg across at most, no fewer than caps of that size could cover."""
     triangles = np.array(trimesh.creation.icosphere(subdivisions=3, radius=1.0).triangles)
     surface = surfaces_of(triangles)
-    caps = 2.0 / (1.0 - np.cos(SURFACE_ANGLE))
+    caps = 2.0 / (1.0 - np.cos(TwinSettings.surface_angle))
     assert caps <= len(np.unique(surface)) <= 4.0 * caps
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     for n in np.unique(surface):
         mine = normals[surface == n]
-        assert (mine @ mine.T).min() >= np.cos(2.0 * SURFACE_ANGLE) - 1e-12
+        assert (mine @ mine.T).min() >= np.cos(2.0 * TwinSettings.surface_angle) - 1e-12
 
 
 def test_a_wall_beside_a_rounded_corner_stays_sharp() -> None:
@@ -123,8 +124,8 @@ def test_a_wall_beside_a_rounded_corner_stays_sharp() -> None:
 
 @pytest.mark.parametrize(("share", "together"), [(0.45, True), (0.55, False)])
 def test_the_size_of_a_facet(share: float, together: bool) -> None:
-    """A long strip counts by twice its width, here of nearly 3 m by share x FACET_SIZE."""
-    width = share * FACET_SIZE
+    """A long strip counts by twice its width, here of nearly 3 m by share x facet_size."""
+    width = share * TwinSettings.facet_size
     surface = surfaces_of(strip([0.0, 5.0], [width, width]))
     assert (len(np.unique(surface)) == 1) is together
 

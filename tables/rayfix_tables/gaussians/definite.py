@@ -1,0 +1,72 @@
+"""Covariances that are positive definite.
+
+Whoever makes a covariance guarantees that it is positive definite, or drops the component together with its weight and
+counts it. Whoever uses one relies on that.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def cholesky_factors(cov: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Cholesky factors of covariances.
+
+    Parameters
+    ----------
+    cov : ndarray of shape (n, d, d)
+
+    Returns
+    -------
+    factors : ndarray of shape (n, d, d)
+        Lower triangular; zero where a covariance is not positive definite.
+    definite : ndarray of bool, shape (n,)
+        Whether a covariance is positive definite.
+    """
+    definite: NDArray[np.bool_] = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
+    if definite.all():
+        try:
+            return np.asarray(np.linalg.cholesky(cov), np.float64), definite
+        except np.linalg.LinAlgError:
+            pass
+    factors = np.zeros(cov.shape)
+    for n in np.flatnonzero(definite):
+        try:
+            factors[n] = np.linalg.cholesky(cov[n])
+        except np.linalg.LinAlgError:
+            definite[n] = False
+    return factors, definite
+
+
+def is_definite(cov: Array) -> NDArray[np.bool_]:
+    """Whether covariances of shape (n, d, d) are positive definite, shape (n,)."""
+    return cholesky_factors(cov)[1]
+
+
+def rounded_definite(cov: Array) -> Array:
+    """Round covariances to single precision so that those that are positive definite remain so.
+
+    Rounding can make a covariance of a large condition number singular. The variances of such a one are raised by a few
+    units of the last place, relative to each of them.
+
+    Parameters
+    ----------
+    cov : ndarray of shape (n, d, d)
+
+    Returns
+    -------
+    ndarray of shape (n, d, d)
+        Numbers of single precision, as float64.
+    """
+    rounded = cov.astype(np.float32).astype(np.float64)
+    lost = np.flatnonzero(~is_definite(rounded))
+    lost = lost[is_definite(cov[lost])]
+    raised = 4.0 * float(np.finfo(np.float32).eps)
+    diagonal = np.arange(cov.shape[-1])
+    while len(lost):
+        variances = cov[lost[:, None], diagonal, diagonal] * (1.0 + raised)
+        rounded[lost[:, None], diagonal, diagonal] = variances.astype(np.float32)
+        lost = lost[~is_definite(rounded[lost])]
+        raised *= 2.0
+    return rounded
