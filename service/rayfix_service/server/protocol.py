@@ -50,6 +50,8 @@ class GatheringTransport:
     lingers : bool
         Whether the client still sends. To close then would take the answer from it that it has not read: this side
         ends, and what comes is thrown away for a moment.
+    is_lingering : bool
+        Whether that moment is now.
     """
 
     def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> None:
@@ -57,7 +59,7 @@ class GatheringTransport:
         self._loop = loop
         self._held: list[bytes] = []
         self._length = 0
-        self._closing = False
+        self.is_lingering = False
         self.lingers = False
 
     def __getattr__(self, name: str) -> Any:
@@ -85,16 +87,16 @@ class GatheringTransport:
 
     def is_closing(self) -> bool:
         """Whether the connection is closed or about to be."""
-        return self._closing or self._transport.is_closing()
+        return self.is_lingering or self._transport.is_closing()
 
     def close(self) -> None:
         """Write all, and close the connection; cut it when the client does not do its part within some seconds."""
         self._flush()
-        if self._closing or self._transport.is_closing():
+        if self.is_lingering or self._transport.is_closing():
             self._transport.close()
             return
         if self.lingers:
-            self._closing = True
+            self.is_lingering = True
             self._transport.write_eof()
             self._transport.resume_reading()
             self._loop.call_later(_LINGER_SECONDS, self._transport.abort)
@@ -179,7 +181,7 @@ class GatheringProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Parse what has come, in pieces of which none takes long."""
-        if self.transport.is_closing():
+        if self.transport.is_lingering:
             self._lingered += len(data)
             if self._lingered > _LINGER_BYTES:
                 self.transport.abort()
@@ -227,7 +229,7 @@ class GatheringProtocol(HttpToolsProtocol):
             self._close_after_early_answer()
 
     def _has_small_body(self) -> bool:
-        lengths = [value for name, value in self.headers if name == b"content-length"]
+        lengths = [value for name, value in self.cycle.scope["headers"] if name == b"content-length"]
         return bool(lengths) and lengths[0].isdigit() and int(lengths[0]) <= _SMALL_REST
 
     def _close_after_early_answer(self) -> None:
@@ -248,11 +250,6 @@ class GatheringProtocol(HttpToolsProtocol):
         super().on_message_begin()
         self._in_head, self._began, self._fed = True, True, 0
 
-    def on_header(self, name: bytes, value: bytes) -> None:
-        """Take a header field; one after the body, which nobody asks for, is left out."""
-        if self._in_head:
-            super().on_header(name, value)
-
     def on_headers_complete(self) -> None:
         """Begin to answer a request, or refuse its head."""
         if len(self.headers) > self._limits.head_fields:
@@ -269,6 +266,8 @@ class GatheringProtocol(HttpToolsProtocol):
         self._in_head, self._in_body = False, True
         self._crowd.work(self)
         super().on_headers_complete()
+        if not self.parser.should_upgrade():
+            self.headers = []  # fields after the body, which nobody asks for, are no part of the request
 
     def on_body(self, body: bytes) -> None:
         """Take a piece of a body."""
@@ -277,8 +276,7 @@ class GatheringProtocol(HttpToolsProtocol):
 
     def on_message_complete(self) -> None:
         """End a request."""
-        self._in_body = False
-        self.transport.lingers = False
+        self._in_body = self.transport.lingers = False
         super().on_message_complete()
 
     def on_response_complete(self) -> None:

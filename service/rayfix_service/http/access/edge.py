@@ -58,26 +58,33 @@ class Edge:
                 "there is nothing at a path with a control character, a backslash, an empty segment, '.' or '..'; "
                 "/docs lists what there is",
             )
-        if self._hosts:
-            for name, value in scope["headers"]:
-                if name == b"host" and not self._may_be_called(value):
+        needs_origin = scope["type"] == "websocket" or not (self._asks_for_keys or is_open(scope["path"]))
+        if not needs_origin and not self._hosts:
+            return
+        origin = site = None
+        for name, value in scope["headers"]:
+            if name == b"host":
+                if self._hosts and not self._may_be_called(value):
                     raise ProblemError(
                         MISDIRECTED,
                         f"the service is not called {value[:100].decode('latin-1')!r}; call it by its address, or "
                         "start it with --allowed-host NAME",
                     )
-        if scope["type"] == "websocket" or not (self._asks_for_keys or is_open(scope["path"])):
-            self._check_origin(scope)
+            elif name == b"origin":
+                origin = value.decode("latin-1")
+            elif name == b"sec-fetch-site":
+                site = value
+        if needs_origin and not (origin is None and site is None):
+            self._check_origin(scope, origin, site)
 
-    def _check_origin(self, scope: Scope) -> None:
-        origin, site = header(scope, b"origin"), header(scope, b"sec-fetch-site")
+    def _check_origin(self, scope: Scope, origin: str | None, site: bytes | None) -> None:
         if origin is None:
             # A page may have a browser fetch pictures or post forms without a word of its origin; who follows a link
             # only looks.
             looks = scope.get("method") in ("GET", "HEAD") and header(scope, b"sec-fetch-mode") == "navigate"
-            fits = looks or site not in ("cross-site", "same-site")
+            fits = looks or site not in (b"cross-site", b"same-site")
         else:
-            fits = site == "same-origin" or is_same_origin(origin, header(scope, b"host") or "")
+            fits = site == b"same-origin" or is_same_origin(origin, header(scope, b"host") or "")
             fits = fits or bool(self._origins & {"*", origin.lower()})
         if fits:
             return
