@@ -283,7 +283,7 @@ def test_the_service_answers_while_the_costliest_reports_run(many_path: Path) ->
 
 
 def _idle(service: RunningApp) -> bool:
-    slow_fixes: Any = service.state.slow_fixes
+    slow_fixes: Any = service.state.services.slow_fixes
     return bool(slow_fixes.under_way == 0)
 
 
@@ -318,7 +318,7 @@ def test_pictures_of_the_table_are_bounded_too(hall_table_path: Path) -> None:
         gate = threading.Event()
 
         async def together() -> list[httpx.Response]:
-            slow_fixes: Any = service.state.slow_fixes
+            slow_fixes: Any = service.state.services.slow_fixes
             held = asyncio.create_task(slow_fixes.run(lambda: gate.wait(30)))
             await asyncio.sleep(0.02)
             try:

@@ -26,11 +26,13 @@ from rayfix_service.http.answering.feed_relay import FeedRelay
 from rayfix_service.http.answering.locating import Answerer
 from rayfix_service.http.answering.served_tables import ServedTable, Tables
 from rayfix_service.http.answering.slow_work import SlowFixes
+from rayfix_service.http.answering.table_cache import PerTable
 from rayfix_service.http.answering.table_checks import TableChecks
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.problems import Problem, install_problems
 from rayfix_service.http.routes import formats, health, positions, stream, table
 from rayfix_service.http.routes.stream import FixEventDocument
+from rayfix_service.http.services import Services, set_services
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.telemetry.connections import NOTE
 from rayfix_service.http.telemetry.metrics import Metrics, forget_dead_workers
@@ -39,7 +41,6 @@ from rayfix_service.server.fast_path import ShortWay
 from rayfix_service.server.stopping import on_stop_signal
 from rayfix_service.web import routes_assets, routes_scene, routes_simulation
 from rayfix_service.web.documents import SimulationRequest
-from rayfix_service.web.table_cache import PerTable
 from rayfix_service.wire import BatchDocument, ReportDocument
 
 _SECOND_LOOK_SECONDS = 0.5
@@ -124,13 +125,15 @@ def create_app(
         When the key file cannot be used.
     """
     settings = settings or ServiceSettings()
+    keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
+    metrics = Metrics()
+    feed = FixFeed(settings.feed_limits)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
-        state = app.state
-        state.tables = tables = Tables(
+        tables = Tables(
             tables_path,
-            state.metrics,
+            metrics,
             runtime_folder=settings.runtime_folder,
             at_hand=at_hand,
             checks=TableChecks(settings.runtime_folder, settings.table_check),
@@ -140,38 +143,50 @@ def create_app(
             keeping.append(asyncio.create_task(_keep_keys(keys, settings.watch_seconds)))
         if settings.own_process:
             keeping.append(asyncio.create_task(_freeze(tables)))
+        relay = None
         if settings.runtime_folder is not None:
-            state.relay = FeedRelay(state.feed, settings.runtime_folder)
-            keeping.append(asyncio.create_task(state.relay.keep()))
-        state.slow_fixes = SlowFixes(
+            relay = FeedRelay(feed, settings.runtime_folder)
+            keeping.append(asyncio.create_task(relay.keep()))
+        slow_fixes = SlowFixes(
             threads=settings.slow_fix_threads, waiting=settings.slow_fixes_waiting, seconds=settings.fix_seconds
         )
         stopping = asyncio.Event()
 
         def stop() -> None:
             stopping.set()
-            state.feed.close()
+            feed.close()
 
         try:
             with on_stop_signal(stop):
-                async with open_hub(settings.hub, on_outcome=state.metrics.hub_told) as hub:
-                    state.answerer = Answerer(
-                        metrics=state.metrics,
-                        feed=state.feed,
-                        slow_fixes=state.slow_fixes,
+                async with open_hub(settings.hub, on_outcome=metrics.hub_told) as hub:
+                    answerer = Answerer(
+                        metrics=metrics,
+                        feed=feed,
+                        slow_fixes=slow_fixes,
                         hub=hub,
                         quick_seconds=settings.quick_fix_seconds,
                     )
+                    services = Services(
+                        settings=settings,
+                        metrics=metrics,
+                        tables=tables,
+                        answerer=answerer,
+                        slow_fixes=slow_fixes,
+                        per_table=PerTable(),
+                        feed=feed,
+                        relay=relay,
+                    )
+                    set_services(app.state, services)
                     if settings.runtime_folder is not None:
                         forget_dead_workers()
                         await _take_turn(tables, settings.runtime_folder / "ready", stopping)
-                    yield {NOTE: state.metrics.connection_closed}
+                    yield {NOTE: metrics.connection_closed}
         finally:
             stop()
             for task in keeping:
                 task.cancel()
             await asyncio.wait(keeping)
-            state.slow_fixes.close()
+            slow_fixes.close()
 
     app = RayfixApp(
         title="rayfix",
@@ -184,16 +199,9 @@ def create_app(
         # The figures are those of /metrics; and to ask at each request whether others are wanted takes long.
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
-    app.state.settings = settings
-    app.state.per_table = PerTable()
-    app.state.metrics = Metrics()
-    app.state.feed = FixFeed(settings.feed_limits)
-    app.state.relay = None
-    app.state.keys = keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
-    app.state.rate_limit = limit = _rate_limit(settings, accounts)
     install_problems(app)
     app.surround(ShortWay, path="/v1/positions", answer=partial(positions.answer_position, app.state))
-    app.surround(Access, keys=keys, limit=limit)
+    app.surround(Access, keys=keys, limit=_rate_limit(settings, accounts))
     if settings.cors_origins:
         # Around the access control, since a browser asks without a key whether it may send one.
         app.surround(
@@ -206,7 +214,7 @@ def create_app(
     app.surround(
         Edge, hosts=settings.hosts, origins=tuple(settings.cors_origins), asks_for_keys=settings.api_keys is not None
     )
-    app.surround(RequestContext, metrics=app.state.metrics)
+    app.surround(RequestContext, metrics=metrics)
     app.include_router(positions.router)
     app.include_router(formats.router)
     app.include_router(stream.router)

@@ -7,7 +7,6 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 from rayfix_service.http.access.guard import charge_report
-from rayfix_service.http.answering.slow_work import SlowFixes
 from rayfix_service.http.problems import (
     FIX_TIMEOUT,
     INVALID_PARAMETER,
@@ -18,7 +17,7 @@ from rayfix_service.http.problems import (
     ProblemError,
     problem_responses,
 )
-from rayfix_service.http.routes.dependencies import TableDep
+from rayfix_service.http.routes.dependencies import ServicesDep, TableDep
 from rayfix_service.web.documents import CoverageDocument, MixtureDocument, mixture_document
 from rayfix_service.web.glb import MEDIA_TYPE, write_glb
 from rayfix_service.web.inspector import mass_by_reflections, view_direction
@@ -40,16 +39,14 @@ StationId = Annotated[str, Path(max_length=128, description="the identifier of a
     response_class=Response,
     responses={200: {"content": {MEDIA_TYPE: {}}}, **problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY)},
 )
-async def get_scene(request: Request, served: TableDep) -> Response:
+async def get_scene(request: Request, services: ServicesDep, served: TableDep) -> Response:
     """Give the mesh as binary glTF: metres, y up by the root node's rotation, materials by name."""
     table = served.locator.table
     tag = f'"{table.table_id[:32]}"'
     headers = {"ETag": tag, "Cache-Control": "no-cache"}
     if request.headers.get("if-none-match") == tag:
         return Response(status_code=304, headers=headers)
-    body = await request.app.state.per_table.get(
-        table.table_id, "scene.glb", lambda: write_glb(table.scene, table.site.name)
-    )
+    body = await services.per_table.get(table.table_id, "scene.glb", lambda: write_glb(table.scene, table.site.name))
     return Response(body, media_type=MEDIA_TYPE, headers=headers)
 
 
@@ -61,6 +58,7 @@ async def get_scene(request: Request, served: TableDep) -> Response:
 )
 async def get_mixture(
     request: Request,
+    services: ServicesDep,
     served: TableDep,
     station_id: StationId,
     azimuth_deg: Annotated[float, Query(ge=-180, le=360, allow_inf_nan=False, description="in the scene frame")],
@@ -82,8 +80,7 @@ async def get_mixture(
         return mixture_document(station_id, view_direction(part, azimuth, zenith, stdev, limit=limit))
 
     charge_report(request)
-    slow_fixes: SlowFixes = request.app.state.slow_fixes
-    return JSONResponse(await slow_fixes.run(view))
+    return JSONResponse(await services.slow_fixes.run(view))
 
 
 @router.get(
@@ -92,7 +89,9 @@ async def get_mixture(
     response_model=CoverageDocument,
     responses=_COMPUTED,
 )
-async def get_coverage(request: Request, served: TableDep, station_id: StationId) -> JSONResponse:
+async def get_coverage(
+    request: Request, services: ServicesDep, served: TableDep, station_id: StationId
+) -> JSONResponse:
     """Tell which share of the free space and of each level's mass belongs to how many reflections.
 
     It counts as a report for the rate limit.
@@ -100,9 +99,8 @@ async def get_coverage(request: Request, served: TableDep, station_id: StationId
     table = served.locator.table
     part = _part(table, station_id)
     charge_report(request)
-    slow_fixes: SlowFixes = request.app.state.slow_fixes
-    document = await request.app.state.per_table.get(
-        table.table_id, f"coverage of {station_id}", lambda: _coverage(station_id, part), run=slow_fixes.run
+    document = await services.per_table.get(
+        table.table_id, f"coverage of {station_id}", lambda: _coverage(station_id, part), run=services.slow_fixes.run
     )
     return JSONResponse(document)
 

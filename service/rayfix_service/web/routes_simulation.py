@@ -9,7 +9,7 @@ from fastapi.responses import JSONResponse
 
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.stopping import Stop
-from rayfix_service.http.answering.slow_work import Asked_contra, SlowFixes, Stoppable
+from rayfix_service.http.answering.slow_work import Asked_contra, Stoppable
 from rayfix_service.http.openapi.examples import REPORT_EXAMPLES
 from rayfix_service.http.openapi.responses import POSITION_PROBLEMS, request_body
 from rayfix_service.http.problems import (
@@ -20,7 +20,7 @@ from rayfix_service.http.problems import (
     ProblemError,
     problem_responses,
 )
-from rayfix_service.http.routes.dependencies import ReportBody, TableDep
+from rayfix_service.http.routes.dependencies import ReportBody, ServicesDep, TableDep
 from rayfix_service.web.documents import (
     PosteriorDocument,
     SimulationDocument,
@@ -46,9 +46,9 @@ SIMULATION_EXAMPLES = {
 @router.get(
     "/viewer", summary="What the viewer may do", responses=problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY)
 )
-async def get_viewer_settings(request: Request, served: TableDep) -> ViewerSettings:
+async def get_viewer_settings(request: Request, services: ServicesDep, served: TableDep) -> ViewerSettings:
     """Tell what the service allows the viewer, and how long the paths of its table are."""
-    return viewer_settings(served.locator.table, simulation=request.app.state.settings.simulation)
+    return viewer_settings(served.locator.table, simulation=services.settings.simulation)
 
 
 @router.post(
@@ -58,18 +58,17 @@ async def get_viewer_settings(request: Request, served: TableDep) -> ViewerSetti
     responses={**POSITION_PROBLEMS, **problem_responses(FORBIDDEN)},
     openapi_extra=request_body(SimulationRequest, SIMULATION_EXAMPLES),
 )
-async def post_simulation(request: Request, served: TableDep, body: ReportBody) -> JSONResponse:
+async def post_simulation(request: Request, services: ServicesDep, served: TableDep, body: ReportBody) -> JSONResponse:
     """Measure a UE at a position as the table has it, with noise, and locate it.
 
     The fix goes to who asked alone: neither to the stream of fixes nor into the figures.
     """
-    if not request.app.state.settings.simulation:
+    if not services.settings.simulation:
         raise ProblemError(
             FORBIDDEN, "this service does not simulate; start it with --allow-simulation, or listen on loopback"
         )
     wanted = parse_simulation(body)
-    slow_fixes: SlowFixes = request.app.state.slow_fixes
-    return JSONResponse(await slow_fixes.locate(_on(served.locator, _simulate_and_locate), wanted))
+    return JSONResponse(await services.slow_fixes.locate(_on(served.locator, _simulate_and_locate), wanted))
 
 
 @router.post(
@@ -79,10 +78,9 @@ async def post_simulation(request: Request, served: TableDep, body: ReportBody) 
     responses=POSITION_PROBLEMS,
     openapi_extra=request_body(ReportDocument, REPORT_EXAMPLES),
 )
-async def post_posterior(request: Request, served: TableDep, body: ReportBody) -> JSONResponse:
+async def post_posterior(request: Request, services: ServicesDep, served: TableDep, body: ReportBody) -> JSONResponse:
     """Give the Gaussians of the posterior and positions drawn from it, for pictures."""
-    slow_fixes: SlowFixes = request.app.state.slow_fixes
-    return JSONResponse(await slow_fixes.locate(_on(served.locator, picture_posterior), parse_report(body)))
+    return JSONResponse(await services.slow_fixes.locate(_on(served.locator, picture_posterior), parse_report(body)))
 
 
 class _Work(Protocol[Asked_contra]):

@@ -169,7 +169,7 @@ def test_ten_thousand_mangled_bodies_break_nothing(hall_table_path: Path):
     async def run() -> dict[int, int]:
         count: dict[int, int] = {}
         async with app.router.lifespan_context(app):
-            await app.state.tables.became_ready.wait()
+            await app.state.services.tables.became_ready.wait()
             for number in range(10_000):
                 path = chance.choice(list(EXAMPLES))
                 body = mangled(chance.choice(EXAMPLES[path]), chance)

@@ -14,12 +14,12 @@ import trimesh
 
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths
 from rayfix_service.fusion.locator import Locator
+from rayfix_service.http.answering.table_cache import PerTable
 from rayfix_service.web import assets
 from rayfix_service.web.documents import MixtureDocument, mixture_document
 from rayfix_service.web.glb import NO_MATERIAL, write_glb
 from rayfix_service.web.inspector import mass_by_reflections, view_direction
 from rayfix_service.web.simulation import find_path, simulate
-from rayfix_service.web.table_cache import PerTable
 from rayfix_service.wire import FixDocument, parse_report
 from rayfix_tables.errors import ReportError
 from rayfix_tables.freespace import FreeSpace

@@ -28,6 +28,7 @@ KEY_SUBPROTOCOL = "rayfix.key."
 _log = logging.getLogger(__name__)
 
 _CLIENT = "rayfix.client"
+_ACCESS = "rayfix.access"
 _ENDING_SECONDS = 1.0
 
 
@@ -39,8 +40,8 @@ class Access:
 
     def __init__(self, app: ASGIApp, keys: ApiKeys | None, limit: RateLimit | None) -> None:
         self._app = app
-        self._keys = keys
-        self._limit = limit
+        self.keys = keys
+        self.limit = limit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -53,11 +54,11 @@ class Access:
         await self._app(scope, receive, send)
 
     def _admit(self, scope: Scope) -> None:
-        if self._keys is None:
+        if self.keys is None:
             # Without keys the service is on loopback, where all clients are one.
             client = "local"
         else:
-            client = self._keys.name_of(_presented_key(scope)) or ""
+            client = self.keys.name_of(_presented_key(scope)) or ""
             if not client:
                 raise ProblemError(
                     UNAUTHORIZED,
@@ -65,9 +66,10 @@ class Access:
                     headers={"WWW-Authenticate": "Bearer"},
                 )
         scope[_CLIENT] = client
-        if self._limit is not None and scope["type"] == "http" and scope["method"] == "POST":
-            _require_tokens(self._limit.seconds_to_wait(client))
-            self._limit.charge(client)
+        scope[_ACCESS] = self
+        if self.limit is not None and scope["type"] == "http" and scope["method"] == "POST":
+            _require_tokens(self.limit.seconds_to_wait(client))
+            self.limit.charge(client)
 
 
 def charge_report(connection: HTTPConnection) -> None:
@@ -78,7 +80,7 @@ def charge_report(connection: HTTPConnection) -> None:
     ProblemError
         When the client has sent more than it may.
     """
-    limit: RateLimit | None = connection.app.state.rate_limit
+    limit = limit_of(connection)
     if limit is not None:
         client = client_of(connection)
         _require_tokens(limit.seconds_to_wait(client))
@@ -96,7 +98,7 @@ def charge_reports(connection: HTTPConnection, reports: int) -> None:
     ProblemError
         When the client has sent more than it may since the head came.
     """
-    limit: RateLimit | None = connection.app.state.rate_limit
+    limit = limit_of(connection)
     if limit is None or reports <= 1:
         return
     client = client_of(connection)
@@ -113,6 +115,16 @@ def _require_tokens(seconds: float) -> None:
         )
 
 
+def limit_of(connection: HTTPConnection) -> RateLimit | None:
+    """Return the rate limit that a request is subject to."""
+    return _access(connection).limit
+
+
+def _access(connection: HTTPConnection) -> Access:
+    access: Access = connection.scope[_ACCESS]
+    return access
+
+
 def client_of(connection: HTTPConnection) -> str:
     """Return the name of the key that a request came with."""
     name: str = connection.scope[_CLIENT]
@@ -125,7 +137,7 @@ def until_revoked(connection: HTTPConnection, end: Callable[[], None]) -> Iterat
 
     Of a client that does not read, what it is sent waits; only to cancel helps.
     """
-    keys: ApiKeys | None = connection.app.state.keys
+    keys = _access(connection).keys
     if keys is None:
         yield
         return

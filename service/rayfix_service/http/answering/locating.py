@@ -6,11 +6,9 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from time import perf_counter
-from typing import Annotated, Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
-from fastapi import Depends
 from pydantic_core import from_json, to_json
-from starlette.requests import HTTPConnection
 
 from rayfix_service.adapters.adapted import Adapted, error_in_message
 from rayfix_service.adapters.formats import write
@@ -213,12 +211,3 @@ def _event(table: str, incoming: Incoming, located: Located) -> bytes:
     """Write what the feed tells of a fix."""
     fix = fix_to_document(located.fix, located.seconds, located.track)
     return to_json({"table": table, "report": incoming.native_document(), "fix": fix})
-
-
-async def get_answerer(connection: HTTPConnection) -> Answerer:
-    """Return what answers."""
-    answerer: Answerer = connection.app.state.answerer
-    return answerer
-
-
-AnswererDep = Annotated[Answerer, Depends(get_answerer)]

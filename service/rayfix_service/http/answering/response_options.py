@@ -2,10 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated
 
-from fastapi import Depends, Query
-from starlette.requests import HTTPConnection
 from starlette.types import Scope
 
 from rayfix_service.adapters.formats import OutputFormat
@@ -46,30 +43,6 @@ class Wanted:
     def follows(self, report: Report) -> bool:
         """Whether a report is to be followed."""
         return self.track and (self.must_track or None not in (report.target_id, report.timestamp))
-
-
-Output = Annotated[
-    OutputFormat | None,
-    Query(
-        description="format of the answer: this service's own (native, the default), 3GPP TS 29.572 local 3D point, or "
-        f"omlox location; the Accept header may name it instead: {', '.join(MEDIA_TYPES)}"
-    ),
-]
-Track = Annotated[
-    bool | None,
-    Query(
-        description="whether to follow targets by their target_id and timestamp, which reports must then have; the "
-        "service's setting unless given"
-    ),
-]
-
-
-async def get_wanted(connection: HTTPConnection, output: Output = None, track: Track = None) -> Wanted:
-    """Read what a request wants."""
-    return wanted_by(connection.scope, connection.app.state.settings, output, track)
-
-
-WantedDep = Annotated[Wanted, Depends(get_wanted)]
 
 
 def wanted_by(

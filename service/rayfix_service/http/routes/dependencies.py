@@ -11,6 +11,9 @@ from fastapi import Depends, Query, Request
 from starlette.requests import HTTPConnection
 from starlette.types import Receive, Scope
 
+from rayfix_service.adapters.formats import OutputFormat
+from rayfix_service.http.answering.locating import Answerer
+from rayfix_service.http.answering.response_options import MEDIA_TYPES, Wanted, wanted_by
 from rayfix_service.http.answering.served_tables import ServedTable, Tables
 from rayfix_service.http.headers import header
 from rayfix_service.http.problems import (
@@ -19,41 +22,75 @@ from rayfix_service.http.problems import (
     UNSUPPORTED_MEDIA_TYPE,
     ProblemError,
 )
-from rayfix_service.http.settings import BodyLimits, ServiceSettings
+from rayfix_service.http.services import Services, services_of
+from rayfix_service.http.settings import BodyLimits
+
+
+async def get_services(connection: HTTPConnection) -> Services:
+    """Return what the application has."""
+    return services_of(connection)
+
+
+ServicesDep = Annotated[Services, Depends(get_services)]
 
 
 async def get_table(
-    connection: HTTPConnection,
+    services: ServicesDep,
     table: Annotated[str | None, Query(description="name of the table; needed where there are several")] = None,
 ) -> ServedTable:
     """Return the table that the query names, or end the request with 503, 404 or 422."""
-    tables: Tables = connection.app.state.tables
-    return tables.named(table)
+    return services.tables.named(table)
 
 
 TableDep = Annotated[ServedTable, Depends(get_table)]
 
 
-async def get_tables(connection: HTTPConnection) -> Tables:
+async def get_tables(services: ServicesDep) -> Tables:
     """Return the tables, ready or not."""
-    tables: Tables = connection.app.state.tables
-    return tables
+    return services.tables
 
 
 TablesDep = Annotated[Tables, Depends(get_tables)]
 
 
-def report_limit(connection: HTTPConnection) -> int:
-    """Return how long a report may be, bytes."""
-    settings: ServiceSettings = connection.app.state.settings
-    return settings.body_limits.report
+async def get_answerer(services: ServicesDep) -> Answerer:
+    """Return what answers."""
+    return services.answerer
+
+
+AnswererDep = Annotated[Answerer, Depends(get_answerer)]
+
+Output = Annotated[
+    OutputFormat | None,
+    Query(
+        description="format of the answer: this service's own (native, the default), 3GPP TS 29.572 local 3D point, or "
+        f"omlox location; the Accept header may name it instead: {', '.join(MEDIA_TYPES)}"
+    ),
+]
+Track = Annotated[
+    bool | None,
+    Query(
+        description="whether to follow targets by their target_id and timestamp, which reports must then have; the "
+        "service's setting unless given"
+    ),
+]
+
+
+async def get_wanted(
+    connection: HTTPConnection, services: ServicesDep, output: Output = None, track: Track = None
+) -> Wanted:
+    """Read what a request wants."""
+    return wanted_by(connection.scope, services.settings, output, track)
+
+
+WantedDep = Annotated[Wanted, Depends(get_wanted)]
 
 
 def body_reader(limit_of: Callable[[BodyLimits], int], *, text: bool = False) -> Callable[[Request], Awaitable[bytes]]:
     """Make the dependency that reads a body, JSON or plain text, within a limit."""
 
     async def read_dependency(request: Request) -> bytes:
-        limit = limit_of(request.app.state.settings.body_limits)
+        limit = limit_of(services_of(request).settings.body_limits)
         return await read_body(request.scope, request.receive, limit, text=text)
 
     return read_dependency

@@ -13,8 +13,7 @@ from rayfix_service.adapters.silabs import SilabsDocument, parse_silabs
 from rayfix_service.adapters.ublox import parse_ublox
 from rayfix_service.http.access.guard import charge_reports
 from rayfix_service.http.answering.cooperative import Patience
-from rayfix_service.http.answering.locating import AnswererDep, foreign
-from rayfix_service.http.answering.response_options import WantedDep
+from rayfix_service.http.answering.locating import foreign
 from rayfix_service.http.openapi.examples import NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.http.openapi.responses import (
     ADAPTED_ANSWER,
@@ -23,7 +22,7 @@ from rayfix_service.http.openapi.responses import (
     request_body,
 )
 from rayfix_service.http.problems import MALFORMED_JSON, Problem
-from rayfix_service.http.routes.dependencies import LinesBody, ReportBody, TableDep
+from rayfix_service.http.routes.dependencies import AnswererDep, LinesBody, ReportBody, TableDep, WantedDep
 from rayfix_service.http.routes.json_answer import JsonAnswer
 
 router = APIRouter(prefix="/v1/positions", tags=["formats"])

@@ -7,7 +7,7 @@ from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, Field
 
 from rayfix_service.http.problems import NOT_READY, problem_responses
-from rayfix_service.http.routes.dependencies import TablesDep
+from rayfix_service.http.routes.dependencies import ServicesDep, TablesDep
 
 router = APIRouter(tags=["health"])
 
@@ -52,7 +52,7 @@ async def readyz(tables: TablesDep) -> Ready:
 
 
 @router.get("/metrics", summary="Figures for Prometheus", response_class=PlainTextResponse)
-async def metrics(request: Request) -> Response:
+async def metrics(request: Request, services: ServicesDep) -> Response:
     """Tell how many requests and fixes there were, how long they took, and which table answers."""
-    text, media_type = request.app.state.metrics.exposition(request.headers.get("accept", ""))
+    text, media_type = services.metrics.exposition(request.headers.get("accept", ""))
     return Response(text, headers={"content-type": media_type})

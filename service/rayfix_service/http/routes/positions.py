@@ -11,14 +11,14 @@ from starlette.types import Receive, Scope
 
 from rayfix_service.http.access.guard import charge_reports
 from rayfix_service.http.answering.cooperative import Patience
-from rayfix_service.http.answering.locating import Answerer, AnswererDep, Incoming, native, problem_of
-from rayfix_service.http.answering.response_options import WantedDep, wanted_by
+from rayfix_service.http.answering.locating import Incoming, native, problem_of
+from rayfix_service.http.answering.response_options import wanted_by
 from rayfix_service.http.openapi.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
 from rayfix_service.http.openapi.responses import NATIVE_ANSWER, POSITION_PROBLEMS, NativeOrOther, request_body
 from rayfix_service.http.problems import Problem
-from rayfix_service.http.routes.dependencies import BatchBody, ReportBody, TableDep, read_body
+from rayfix_service.http.routes.dependencies import AnswererDep, BatchBody, ReportBody, TableDep, WantedDep, read_body
 from rayfix_service.http.routes.json_answer import JsonAnswer, write_json
-from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.http.services import services_in
 from rayfix_service.wire import BatchDocument, MalformedJsonError, ReportDocument
 from rayfix_service.wire.batches import split_batch
 from rayfix_service.wire.problems import MAX_PROBLEMS
@@ -58,11 +58,11 @@ async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple
     ``state`` is the application's. Requests that came together take each of the three steps together: the processor's
     caches hold the code of one step and not that of all, so that this saves an eighth of the time.
     """
-    settings: ServiceSettings = state.settings
-    answerer: Answerer = state.answerer
-    table = state.tables.named(None)
-    body = await read_body(scope, receive, settings.body_limits.report)
-    wanted = wanted_by(scope, settings)
+    services = services_in(state)
+    answerer = services.answerer
+    table = services.tables.named(None)
+    body = await read_body(scope, receive, services.settings.body_limits.report)
+    wanted = wanted_by(scope, services.settings)
     incoming = await answerer.read(native, body)
     await asyncio.sleep(0)
     located = await answerer.locate(table, incoming, wanted)

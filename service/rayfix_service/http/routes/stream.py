@@ -13,13 +13,10 @@ from pydantic import BaseModel, Field
 from pydantic_core import to_json
 from starlette.websockets import WebSocketDisconnect, WebSocketDisconnected
 
-from rayfix_service.http.access.guard import client_of, until_revoked
-from rayfix_service.http.access.rates import RateLimit
-from rayfix_service.http.answering.feed import FixEvent, FixFeed
-from rayfix_service.http.answering.feed_relay import FeedRelay
-from rayfix_service.http.answering.locating import Answerer, AnswererDep, native
-from rayfix_service.http.answering.response_options import Wanted, WantedDep
-from rayfix_service.http.answering.served_tables import Tables
+from rayfix_service.http.access.guard import client_of, limit_of, until_revoked
+from rayfix_service.http.answering.feed import FixEvent
+from rayfix_service.http.answering.locating import native
+from rayfix_service.http.answering.response_options import Wanted
 from rayfix_service.http.openapi.examples import FIX_EVENT_EXAMPLE
 from rayfix_service.http.problems import (
     BODY_TOO_LARGE,
@@ -31,7 +28,8 @@ from rayfix_service.http.problems import (
     problem_document,
     problem_responses,
 )
-from rayfix_service.http.routes.dependencies import TableDep, TablesDep, report_limit
+from rayfix_service.http.routes.dependencies import ServicesDep, TableDep, WantedDep
+from rayfix_service.http.services import Services
 from rayfix_service.wire import FixDocument, ReportDocument
 
 router = APIRouter(prefix="/v1", tags=["streams"])
@@ -82,37 +80,37 @@ class EventStreamResponse(StreamingResponse):
 )
 async def get_fixes(
     request: Request,
-    tables: TablesDep,
+    services: ServicesDep,
     table: Annotated[str | None, Query(description="the only table to hear of")] = None,
     target_id: Annotated[str | None, Query(description="the only target to hear of", max_length=256)] = None,
 ) -> EventStreamResponse:
     """Tell of every fix that the service makes from now on, by whichever route its report came."""
-    tables.all()  # none answers before it is ready
+    services.tables.all()  # none answers before it is ready
     if table is not None:
-        tables.named(table)
-    if request.app.state.feed.is_full:
+        services.tables.named(table)
+    if services.feed.is_full:
         raise ProblemError(
             OVERLOADED,
             "as many listen to the fixes as may; try again later, or start the service with more --listeners",
             headers={"Retry-After": "10"},
         )
     return EventStreamResponse(
-        _events(request, table, target_id),
+        _events(request, services, table, target_id),
         # A proxy that gathers answers before it passes them on would gather these for ever.
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
 
 
-async def _events(request: Request, table: str | None, target_id: str | None) -> AsyncIterator[bytes]:
+async def _events(
+    request: Request, services: Services, table: str | None, target_id: str | None
+) -> AsyncIterator[bytes]:
     """Write the events of a feed, in pieces after which the client may have to read first."""
-    feed: FixFeed = request.app.state.feed
-    relay: FeedRelay | None = request.app.state.relay
     with (
-        feed.subscribe(table=table, target_id=target_id) as subscription,
+        services.feed.subscribe(table=table, target_id=target_id) as subscription,
         until_revoked(request, subscription.close),
     ):
-        if relay is not None:
-            await relay.connect()
+        if services.relay is not None:
+            await services.relay.connect()
         yield b"retry: %d\n\n" % _RETRY_MILLISECONDS
         while True:
             await subscription.wait(HEARTBEAT_SECONDS)
@@ -150,7 +148,7 @@ async def get_table_name(table: TableDep, name: Annotated[str | None, Query(alia
 @router.websocket("/stream")
 async def stream(
     websocket: WebSocket,
-    answerer: AnswererDep,
+    services: ServicesDep,
     table: Annotated[str | None, Depends(get_table_name)],
     wanted: WantedDep,
 ) -> None:
@@ -160,8 +158,8 @@ async def stream(
     answered waits. Each is answered from the table that is served then.
     """
     await websocket.accept(subprotocol="rayfix" if "rayfix" in websocket.scope["subprotocols"] else None)
-    limit = report_limit(websocket)
-    rate: RateLimit | None = websocket.app.state.rate_limit
+    limit = services.settings.body_limits.report
+    rate = limit_of(websocket)
     client = client_of(websocket)
     closing: set[asyncio.Task[None]] = set()
 
@@ -182,7 +180,7 @@ async def stream(
                         BODY_TOO_LARGE, f"the message is longer than {limit} bytes; send fewer measurements at once"
                     )
                 else:
-                    answer = await _answer(websocket.app.state.tables, table, answerer, body, wanted)
+                    answer = await _answer(services, table, body, wanted)
                 await websocket.send_text(to_json(answer, inf_nan_mode="null").decode())
                 await asyncio.sleep(0)  # whatever else is on the loop comes in between
         except (WebSocketDisconnect, WebSocketDisconnected):
@@ -195,12 +193,13 @@ async def _close(websocket: WebSocket) -> None:
         await websocket.close(_REVOKED, "the API key is no longer taken")
 
 
-async def _answer(tables: Tables, table: str | None, answerer: Answerer, body: bytes, wanted: Wanted) -> dict[str, Any]:
+async def _answer(services: Services, table: str | None, body: bytes, wanted: Wanted) -> dict[str, Any]:
     """Answer a message from the table that is served now."""
     try:
-        served = tables.named(table)
+        served = services.tables.named(table)
     except ProblemError as error:
         return problem_document(error.kind, str(error), error.errors)
+    answerer = services.answerer
     return await answerer.answer_or_problem(served, partial(answerer.read, native, body), wanted)
 
 

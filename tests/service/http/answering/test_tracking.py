@@ -6,16 +6,14 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import pytest
-from starlette.requests import HTTPConnection
 
 from rayfix.client.models import fix_answer
 from rayfix_service.adapters.omlox_hub import HubSettings
-from rayfix_service.http.answering.response_options import get_wanted
+from rayfix_service.http.answering.response_options import wanted_by
 from rayfix_service.http.openapi.examples import SILABS_EXAMPLES
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.server.app import create_app
@@ -134,10 +132,8 @@ def test_the_accept_header_chooses_the_format(hall_table_path: Path):
     ],
 )
 def test_accept_headers(accept: str | None, output: str, media_type: str | None):
-    app = SimpleNamespace(state=SimpleNamespace(settings=SETTINGS))
     headers = [] if accept is None else [(b"accept", accept.encode())]
-    scope = {"type": "http", "headers": headers, "app": app, "query_string": b""}
-    wanted = asyncio.run(get_wanted(HTTPConnection(scope)))
+    wanted = wanted_by({"type": "http", "headers": headers}, SETTINGS)
     assert wanted.output == output
     assert wanted.media_type == (media_type or f"application/vnd.rayfix.{output}+json")
     assert not wanted.track
