@@ -2,12 +2,16 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: client viewer browser screenshots demo test test-portable lint types package images accuracy openapi clean
+.PHONY: client viewer browser screenshots demo lock test test-portable lint types package images accuracy openapi clean
+
+# pip takes what builds the package from these too: under the first name until 25.2, under the second from 25.3 on.
+PINNED := PIP_CONSTRAINT=$(CURDIR)/constraints.txt PIP_BUILD_CONSTRAINT=$(CURDIR)/constraints.txt
 
 # The environment is made anew when what it holds has changed.
 $(VENV)/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
+	$(PINNED) $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,ifc]' --group dev
 	touch $@
 
 # The viewer's files, which the service gives at / and packages hold. Where they cannot be built, the service does without.
@@ -59,9 +63,13 @@ types: $(VENV)/.done
 # The wheel, in an environment of its own and outside the checkout, runs the demo. What the service needs has wheels for arm64.
 package: $(VENV)/.done viewer
 	rm -rf dist
-	$(BIN)/python -m build --outdir dist .
+	$(PINNED) $(BIN)/python -m build --outdir dist .
 	$(BIN)/python tests/package/check_wheel.py dist
 	$(BIN)/python docker/check_wheels.py
+
+# What the images install, by hashes; after a change of constraints.txt or of what pyproject.toml asks for.
+lock: $(VENV)/.done
+	$(BIN)/python docker/lock.py
 
 # The images, built and run without a container engine: as root, with buildah and debootstrap.
 images: $(VENV)/.done viewer

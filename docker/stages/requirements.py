@@ -1,7 +1,7 @@
-"""Print what extras of pyproject.toml need, one requirement a line: ``requirements.py PYPROJECT.toml EXTRA ...``.
+"""Print what extras of pyproject.toml need, with hashes: ``requirements.py REQUIREMENTS.lock EXTRA ...``.
 
 With it an image installs the dependencies before the code is copied, so that a change of the code leaves their layer as
-it is. Only the standard library is needed.
+it is. ``build`` stands for what builds the wheel. Only the standard library is needed.
 """
 
 import re
@@ -9,6 +9,8 @@ import sys
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
+
+BUILD = "build"
 
 
 def requirements(pyproject: Path, extras: Iterable[str]) -> list[str]:
@@ -37,5 +39,26 @@ def requirements(pyproject: Path, extras: Iterable[str]) -> list[str]:
     return list(found)
 
 
+def build_requirements(pyproject: Path) -> list[str]:
+    """Return what builds the package."""
+    return list(tomllib.loads(pyproject.read_text(encoding="utf-8"))["build-system"]["requires"])
+
+
+def locked(lock: Path, extras: Iterable[str]) -> str:
+    """Return the entries of a lock file that any of these extras needs, for ``pip install --require-hashes``.
+
+    Raises
+    ------
+    ValueError
+        When no entry is for one of them.
+    """
+    wanted = set(extras)
+    entries = re.findall(r"^# \[([^\]]*)\]\n((?:[^#\n].*\n)+)", lock.read_text(encoding="utf-8"), re.MULTILINE)
+    known = {extra for needed, _ in entries for extra in needed.split()}
+    if not wanted or wanted - known:
+        raise ValueError(f"{lock} is for {', '.join(sorted(known))}, and not for {', '.join(sorted(wanted - known))}")
+    return "".join(text for needed, text in entries if wanted & set(needed.split()))
+
+
 if __name__ == "__main__":
-    print("\n".join(requirements(Path(sys.argv[1]), sys.argv[2:])))
+    print(locked(Path(sys.argv[1]), sys.argv[2:]), end="")

@@ -28,6 +28,11 @@ VALUES: dict[str, dict[str, Any]] = {
         "apiKeys": {"existingSecret": "keys"},
         "service": {"accessLog": True, "rateLimit": 100, "annotations": {"a": "b"}},
         "images": {"service": {"repository": "r/s", "digest": "sha256:" + "0" * 64}, "pullSecrets": [{"name": "p"}]},
+        "networkPolicy": {
+            "enabled": True,
+            "from": [{"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "ingress"}}}],
+            "egress": [{"to": [{"ipBlock": {"cidr": "10.0.0.0/8"}}], "ports": [{"port": 8081}]}],
+        },
         "podAnnotations": {"a": "b"},
         "nodeSelector": {"disk": "ssd"},
         "tolerations": [{"key": "a", "operator": "Exists"}],
@@ -80,7 +85,14 @@ def test_the_schema_would_object():
 
 @pytest.mark.parametrize(
     "values",
-    [{"tables": {}}, {"table": {"source": "url"}}, {"table": {"source": "bucket"}}, {"service": {"workers": 0}}],
+    [
+        {"tables": {}},
+        {"table": {"source": "url"}},
+        {"table": {"source": "bucket"}},
+        {"service": {"workers": 0}},
+        {"networkPolicy": {"enable": True}},
+        {"images": {"service": {"repository": "r", "digest": "sha256:0"}}},
+    ],
 )
 def test_values_that_are_none_are_refused(values: dict[str, Any]):
     with pytest.raises(helm_python.HelmValuesError):
@@ -122,6 +134,73 @@ def test_pods_are_confined_and_their_commands_are_rayfix(values: dict[str, Any])
                 options = make_parser().parse_args(container["args"])
                 assert str(options.tables) == pod["initContainers"][0]["args"][-1]
                 assert any(options.api_keys.is_relative_to(mount["mountPath"]) for mount in container["volumeMounts"])
+
+
+def policies(values: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Specifications of the network policies by the component that they are for."""
+    found = [entry["spec"] for (kind, _), entry in render(values).items() if kind == "NetworkPolicy"]
+    return {spec["podSelector"]["matchLabels"]["app.kubernetes.io/component"]: spec for spec in found}
+
+
+@pytest.mark.parametrize("values", VALUES.values(), ids=VALUES)
+def test_every_pod_has_a_network_policy(values: dict[str, Any]):
+    objects, found = render(values), policies(values)
+    for kind, component in (("Deployment", "service"), ("Job", "offline")):
+        pods = [entry["spec"]["template"] for (its_kind, _), entry in objects.items() if its_kind == kind]
+        for pod in pods:
+            selector = found[component]["podSelector"]["matchLabels"]
+            assert selector.items() <= pod["metadata"]["labels"].items()
+            assert found[component]["policyTypes"] == ["Ingress", "Egress"]
+    assert len(found) == len([kind for kind, _ in objects if kind in ("Deployment", "Job")])
+
+
+def ports(rules: list[dict[str, Any]]) -> list[Any]:
+    return [port["port"] for rule in rules for port in rule["ports"]]
+
+
+def test_the_service_is_asked_on_its_port_and_asks_nobody():
+    found = policies({})
+    assert found["service"]["ingress"] == [{"ports": [{"port": "http", "protocol": "TCP"}]}]
+    assert found["service"]["egress"] == found["offline"]["egress"] == found["offline"]["ingress"] == []
+    (container,) = only(render({}), "Deployment")["spec"]["template"]["spec"]["containers"]
+    assert "http" in {port["name"] for port in container["ports"]}
+
+
+def test_what_is_needed_may_be_asked():
+    """The table's store or the scheduler on its port, and names; what the values add comes last."""
+    for address, port in (
+        ("https://store.example/a.h5", 443),
+        ("http://store.example/a.h5", 80),
+        ("http://store:9000/a.h5?x=:1", 9000),
+        ("https://[fd00::1]:9443/a.h5", 9443),
+        ("https://[fd00::1]/a.h5", 443),
+    ):
+        found = policies({"table": {"source": "url", "url": address, "id": TABLE_ID}})
+        assert list(found) == ["service"]
+        assert ports(found["service"]["egress"]) == [53, 53, port], address
+    assert ports(policies({"build": {"cluster": "tcp://dask:8790"}})["offline"]["egress"]) == [53, 53, 8790]
+    assert ports(policies({"build": {"cluster": "tcp://dask"}})["offline"]["egress"]) == [53, 53, 8786]
+    everything = policies(VALUES["everything"])["service"]
+    assert ports(everything["egress"]) == [53, 53, 8081]
+    assert everything["ingress"][0]["from"] == VALUES["everything"]["networkPolicy"]["from"]
+
+
+def test_policies_can_be_left_out():
+    assert policies({"networkPolicy": {"enabled": False}}) == {}
+
+
+def test_images_go_by_digest_where_one_is_given():
+    digest = "sha256:" + "1" * 64
+    objects = render(
+        {"images": {name: {"repository": f"r/{name}", "digest": digest} for name in ("offline", "service")}}
+    )
+    images = [
+        container["image"]
+        for kind in ("Deployment", "Job")
+        for group in ("initContainers", "containers")
+        for container in only(objects, kind)["spec"]["template"]["spec"].get(group, [])
+    ]
+    assert sorted(images) == [f"r/offline@{digest}", f"r/service@{digest}", f"r/service@{digest}"]
 
 
 def test_a_change_of_the_site_makes_a_new_table():

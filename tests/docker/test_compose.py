@@ -52,6 +52,13 @@ def test_every_container_is_confined(services: dict[str, Any]):
             assert service["deploy"]["resources"]["limits"]["memory"], name
 
 
+def test_images_may_be_named_by_digest():
+    names = {"OFFLINE", "SERVICE", "PROMETHEUS", "MOSQUITTO"}
+    digests = {f"RAYFIX_{name}_IMAGE": f"r/{name.lower()}@sha256:{'0' * 64}" for name in names}
+    named = Composition(path=DOCKER / "compose.yaml", volumes=Path("/volumes"), variables=digests)
+    assert {service["image"] for service in named.document()["services"].values()} == set(digests.values())
+
+
 def test_every_key_is_known(services: dict[str, Any]):
     assert {key for service in services.values() for key in service} <= HONOURED | WITHOUT_ENGINE
 

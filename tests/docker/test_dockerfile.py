@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from requirements import requirements
+from requirements import locked, requirements
 from tests.support.checkout import ROOT
 
 OFFLINE_ONLY = {"trimesh", "scikit-learn", "embreex", "scipy", "networkx", "distributed", "ifcopenshell"}
@@ -56,12 +56,35 @@ def test_extras_within_extras_are_resolved(tmp_path: Path):
 def test_dependencies_are_pinned_and_there_before_the_code(stages: dict[str, list[str]]):
     for name in ("offline-dependencies", "service-dependencies"):
         text = " ".join(stages[name])
-        assert "--constraint constraints.txt" in text
+        assert re.search(r"requirements\.py requirements\.lock \$\{\w+_EXTRAS\} >requirements\.txt", text)
+        assert "--require-hashes --requirement requirements.txt" in text
         assert "--only-binary :all:" in text
-        assert "COPY" not in text  # of pyproject.toml and constraints.txt, which its base has, and nothing else
+        assert "COPY" not in text  # of requirements.lock, which its base has, and nothing else
         assert stages[name][0] == f"FROM tools AS {name}"
     copied = " ".join(line for line in stages["tools"] if line.startswith("COPY"))
-    assert copied == "COPY pyproject.toml constraints.txt docker/stages/requirements.py ./"
+    assert copied == "COPY docker/requirements.lock docker/stages/requirements.py ./"
+
+
+def test_what_builds_the_wheel_is_pinned_by_hash_too(stages: dict[str, list[str]]):
+    (install,) = (line for line in stages["wheel"] if "--requirement" in line)
+    assert "requirements.py requirements.lock build >build.txt" in install
+    assert "--only-binary :all: --require-hashes --requirement build.txt" in install
+    (build,) = (line for line in stages["wheel"] if "pip wheel" in line)
+    assert "--no-build-isolation" in build
+    assert "--no-deps" in build
+
+
+def test_bases_are_arguments_and_may_be_digests(stages: dict[str, list[str]]):
+    bases = {stage[0].split()[1] for name, stage in stages.items() if name}
+    arguments = {line.split()[1].partition("=")[0] for line in stages[""] if line.startswith("ARG")}
+    for base in bases - set(stages) - {"scratch"}:
+        assert re.sub(r".*\$\{(\w+)\}", r"\1", base) in arguments, base
+
+
+def test_the_defaults_of_the_extras_are_locked(stages: dict[str, list[str]]):
+    for name in ("offline-dependencies", "service-dependencies"):
+        (extras,) = re.findall(r'ARG \w+_EXTRAS="([^"]*)"', " ".join(stages[name]))
+        assert locked(ROOT / "docker/requirements.lock", extras.split())
 
 
 @pytest.mark.parametrize("name", ["offline", "service"])

@@ -57,3 +57,18 @@ readOnlyRootFilesystem: true
 allowPrivilegeEscalation: false
 capabilities: {drop: [ALL]}
 {{- end }}
+
+{{/* Rule of a network policy: names may be looked up. */}}
+{{- define "rayfix.nameLookups" -}}
+- ports:
+    - {port: 53, protocol: UDP}
+    - {port: 53, protocol: TCP}
+{{- end }}
+
+{{/* Port of an address: call with a URL. */}}
+{{- define "rayfix.portOf" -}}
+{{- $url := urlParse . -}}
+{{- $named := regexFind ":[0-9]+$" $url.host | trimPrefix ":" -}}
+{{- $usual := dict "https" "443" "http" "80" "tcp" "8786" "tls" "8786" -}}
+{{ $named | default (get $usual $url.scheme) | default "443" }}
+{{- end }}
