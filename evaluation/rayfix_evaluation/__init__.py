@@ -2,3 +2,9 @@
 
 Its public face is the command line (``rayfix evaluate``, ``plan``, ``plot``); all modules may change without notice.
 """
+
+from pathlib import Path
+
+from rayfix_tables.gaussians.kernel_cache import ensure_kernel_cache
+
+ensure_kernel_cache(Path(__file__).parent)
