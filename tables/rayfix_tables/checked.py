@@ -132,7 +132,7 @@ def check_file(
         When the file cannot be checked now.
     """
     seconds = limits.seconds_for(opened.size)
-    patience = _PATIENCE * (seconds + _OWN_SECONDS)
+    patience = _PATIENCE * seconds + _OWN_SECONDS
     arguments = [str(opened.path), str(seconds), str(limits.memory_for(opened.size)), str(int(whole))]
     try:
         with subprocess.Popen(

@@ -143,14 +143,12 @@ FORGET = """\
 def test_workers_forget_the_same_dead_worker_at_the_same_time(tmp_path: Path):
     folder = tmp_path / "figures"
     folder.mkdir()
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait(30)
-    names = [f"gauge_livemax_{gone.pid}.db", f"gauge_livemin_{gone.pid}.db", "gauge_livemax_notes.db"]
-    names += [f"gauge_livesum{n}_{gone.pid}.db" for n in range(3000)]
-    kept = [f"counter_{gone.pid}.db", f"gauge_livemax_{os.getpid()}.db", "gauge_livemax_notes.db"]
+    gone = range(5_000_000, 5_001_000)  # above the greatest number of a process
+    names = [f"gauge_{mode}_{pid}.db" for pid in gone for mode in ("livemax", "livemin")]
+    kept = ["counter_5000000.db", f"gauge_livemax_{os.getpid()}.db"]
     for name in {*names, *kept}:
         (folder / name).touch()
-    environment = {**os.environ, "PROMETHEUS_MULTIPROC_DIR": str(folder)}
+    environment = {**os.environ, "PROMETHEUS_MULTIPROC_DIR": str(folder), "PYTHONHASHSEED": "0"}
     command = [sys.executable, "-c", textwrap.dedent(FORGET), str(tmp_path / "begin")]
     with_pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment}
     processes = [subprocess.Popen(command, **with_pipes) for _ in range(3)]  # type: ignore[call-overload]

@@ -100,7 +100,7 @@ def open_table_file(path: Path) -> Iterator[OpenFile]:
 def _open(path: Path) -> int:
     try:
         if (what := why_not_regular(path)) is not None:
-            raise NotATableError(f"{path} {what} and not an HDF5 file; give a file that 'rayfix build' wrote")
+            raise NotATableError(f"{path} {what}, which is not a rayfix table; give a file that 'rayfix build' wrote")
         return os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (FileNotFoundError, NotADirectoryError):
         raise TableError(f"there is no table at {path}; build one with 'rayfix build SITE.toml -o {path}'") from None

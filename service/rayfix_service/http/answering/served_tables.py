@@ -363,6 +363,11 @@ class Tables:
             for name in self._refused.keys() - found.files.keys() - found.unfit.keys():
                 del self._refused[name]
             self._metrics.tables_refused(len(self.refused))
+            for name in self._locks.keys() - found.files.keys() - self._served.keys() - self._looking.keys():
+                if not self._locks[name].locked():
+                    del self._locks[name]
+                    self._looked_at.pop(name, None)
+                    self._not_before.pop(name, None)
         return [self._refuse(name, self._files.path, None, TableError(reason)) for name, reason in found.unfit.items()]
 
     def _become_ready(self) -> None:
