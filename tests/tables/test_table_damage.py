@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
+from rayfix_tables.disk.layout import damage_reported
 from rayfix_tables.disk.schema import LEVEL_DATASETS, SCENE_DATASETS
 from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError, TableError
 from rayfix_tables.mixture import FIELD_SHAPES
@@ -307,3 +308,10 @@ def test_the_hall_table_is_whole_and_a_change_is_found(hall_table_copy: Path, ha
         table.verify()
     shutil.copy(hall_table_path, hall_table_copy)
     Table.open(hall_table_copy).verify()
+
+
+def test_too_little_memory_is_no_damage(tmp_path: Path) -> None:
+    path = tmp_path / "t.h5"
+    with pytest.raises(TableError, match="not enough memory") as caught, damage_reported(path):
+        raise MemoryError
+    assert not isinstance(caught.value, CorruptTableError)

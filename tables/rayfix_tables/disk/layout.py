@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rayfix_tables.disk.files import OpenFile
 from rayfix_tables.disk.schema import CELL_CHANGE, FORMAT, FORMAT_VERSION, LEVEL_DATASETS, LOG_BALANCE, SCENE_DATASETS
-from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError
+from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError, TableError
 
 _MOST_ATTRIBUTES = 64  # of one object; a station has 14
 _LEAST_OBJECT_BYTES = 16
@@ -107,11 +107,15 @@ def damage_reported(path: Path) -> Iterator[None]:
     """
     try:
         yield
+    except MemoryError as error:
+        # What the file says that it holds is bounded by its size, so that the file is not to blame.
+        raise TableError(
+            f"{path} cannot be read: there is not enough memory for it; free some, or use a larger machine"
+        ) from error
     except (
         ArithmeticError,
         AttributeError,
         LookupError,
-        MemoryError,
         OSError,
         RuntimeError,
         SystemError,
