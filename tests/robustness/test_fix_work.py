@@ -4,6 +4,7 @@ import asyncio
 import math
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,11 @@ from rayfix_service.fusion.measurements.report import (
     TimeDifference,
     TimeOfArrival,
 )
+from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import FixStoppedError, Stop
 from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire import report_to_document
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
@@ -176,6 +179,31 @@ def test_ordinary_reports_do_not_reach_the_bounds(locator: Locator) -> None:
             assert other.position is not None
             np.testing.assert_array_equal(fix.position, other.position)
             np.testing.assert_array_equal(fix.covariance, other.covariance)
+
+
+def test_a_track_takes_in_a_bounded_number_of_hypotheses(locator: Locator) -> None:
+    """A report of 2048 kept the event loop for 30 to 70 ms with each target that is followed."""
+    ranges = tuple(Range(station_id=name, path_length=7.0, stdev=3.0) for name in stations_of(locator))
+    fused = locator.fuse(Report(measurements=ranges, target_id="tag", timestamp="2026-01-31T10:00:00Z"))
+    some = fused.hypotheses
+    assert some is not None
+    assert some.best(len(some)) is some
+    many = Hypotheses(
+        log_weight=np.concatenate([some.log_weight, np.full(2000, some.log_weight[-1] - 10.0)]),
+        mean=np.concatenate([some.mean, np.broadcast_to(some.mean[-1], (2000, 3))]),
+        cov=np.concatenate([some.cov, np.broadcast_to(some.cov[-1], (2000, 3, 3))]),
+        outlier=np.concatenate([some.outlier, np.broadcast_to(some.outlier[-1], (2000, some.outlier.shape[1]))]),
+        log_lost=some.log_lost,
+    )
+    places = []
+    for hypotheses in (many, many.best(512)):
+        tracker = Tracker(locator.table.scene)
+        for second in range(3):
+            fix = replace(fused.fix, timestamp=f"2026-01-31T10:00:{second:02}Z")
+            track = tracker.follow(replace(fused, fix=fix, hypotheses=hypotheses))
+        assert track is not None
+        places.append(track.estimate.position)
+    np.testing.assert_array_equal(*places)
 
 
 # --- the end at the limit --------------------------------------------------------------------------------

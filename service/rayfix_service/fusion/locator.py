@@ -150,7 +150,7 @@ class Locator:
         lost: dict[int, str] = {}
         left, count = self._most_considered, len(sorted_report.observations)
         for place, observation in enumerate(sorted_report.observations):
-            factor, reason = None, _TOO_MUCH
+            factor = None
             if left > 0:
                 factor = make_factor(
                     observation,
@@ -162,18 +162,19 @@ class Locator:
                     most_considered=left // (count - place),
                     stop=stop,
                 )
-                reason = _NO_RAYS.format(observation.station_id)
             if factor is not None:
                 left -= factor.considered
                 observations.append(observation)
                 factors.append(factor)
                 continue
+            reason = _NO_RAYS.format(observation.station_id) if left > 0 else _TOO_MUCH
             for index in (observation.angle_index, *observation.timing_indices):
                 if index is not None:
                     unused[index] = reason
             lost |= dict.fromkeys(observation.differences, reason)
         # A time difference is of two paths, and says something as long as one of them does.
-        unused |= {n: lost[n] for n in lost.keys() - {n for o in observations for n in o.differences}}
+        if lost:
+            unused |= {n: lost[n] for n in lost.keys() - {n for o in observations for n in o.differences}}
         return observations, factors
 
 

@@ -14,9 +14,6 @@ from rayfix_service.fusion.posterior.voxels import is_free_place, nearest_free
 _SAME_HILL = 9.0
 """Two modes nearer than this, squared and in what either is uncertain by, are two humps of one hill."""
 
-_NEAR = 3.0
-"""A position in a solid moves to free space within this many standard deviations."""
-
 
 @numba.njit(cache=True, nogil=True)
 def find_hills(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any, stop: Any) -> Any:
@@ -66,7 +63,7 @@ def find_hills(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
     moved = False
     for n in range(len(top)):
         if not is_free_place(free, origin, voxel_size, position[n]):
-            moved |= nearest_free(position[n], moment[n], _NEAR, origin, voxel_size, free)
+            moved |= nearest_free(position[n], moment[n], origin, voxel_size, free)
     if moved:
         moment = _second_moments(weight, mean, cov, member, probability, position)
     order = np.argsort(-probability, kind="mergesort")

@@ -7,6 +7,9 @@ import numpy as np
 
 from rayfix_service.fusion.posterior.cholesky import cholesky, invert
 
+_BLOCK = 8
+"""Voxels along each side of a block that is searched at a time."""
+
 
 @numba.njit(cache=True, nogil=True)
 def is_free(free: Any, x: Any, y: Any, z: Any) -> Any:
@@ -45,47 +48,57 @@ def is_free_place(free: Any, origin: Any, voxel_size: Any, place: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def nearest_free(position: Any, cov: Any, reach: Any, origin: Any, voxel_size: Any, free: Any) -> Any:
-    """Move a position, in place, to the nearest one in the free space; False when there is none within reach.
+def nearest_free(position: Any, cov: Any, origin: Any, voxel_size: Any, free: Any) -> Any:
+    """Move a position, in place, to the nearest one in the free space; False when there is no free space.
+
+    Blocks of voxels are looked at from the nearest on, until none that is left can hold a nearer place: a place so many
+    metres away is at least as many times the largest deviation away, which is no more than the root of the trace.
 
     Parameters
     ----------
     position : ndarray of shape (3,), m
     cov : ndarray of shape (3, 3), m2
         What near means.
-    reach : float
-        Standard deviations along each axis of the box that is searched, which is wider by a voxel.
     origin, voxel_size, free
         As in :class:`~rayfix_tables.freespace.FreeSpace`.
     """
     lower, precision = np.empty((3, 3)), np.empty((3, 3))
     cholesky(cov, lower)
     invert(lower, precision)
-    first, stop = np.empty(3, np.int64), np.empty(3, np.int64)
-    for i in range(3):
-        far = reach * np.sqrt(cov[i, i]) + voxel_size
-        first[i] = max(0, int(np.floor((position[i] - far - origin[i]) / voxel_size)))
-        stop[i] = min(free.shape[i], int(np.floor((position[i] + far - origin[i]) / voxel_size)) + 1)
+    trace = cov[0, 0] + cov[1, 1] + cov[2, 2]
+    nx, ny, nz = free.shape
+    bx, by, bz = (nx + _BLOCK - 1) // _BLOCK, (ny + _BLOCK - 1) // _BLOCK, (nz + _BLOCK - 1) // _BLOCK
+    bound = np.empty(bx * by * bz)
+    for b in range(len(bound)):
+        square = 0.0
+        for i, n in enumerate((b // (by * bz), b // bz % by, b % bz)):
+            low = origin[i] + voxel_size * _BLOCK * n
+            square += (min(max(position[i], low), low + voxel_size * _BLOCK) - position[i]) ** 2
+        bound[b] = square / trace
     least = np.inf
     apart, best = np.empty(3), np.empty(3)
     # Just inside the voxels: their faces may be another's.
     inside = 1e-6 * voxel_size
-    for x in range(first[0], stop[0]):
-        for y in range(first[1], stop[1]):
-            for z in range(first[2], stop[2]):
-                if not free[x, y, z]:
-                    continue
-                square = 0.0
-                for i, n in enumerate((x, y, z)):
-                    low = origin[i] + voxel_size * n
-                    apart[i] = min(max(position[i], low + inside), low + voxel_size - inside) - position[i]
-                for i in range(3):
-                    for j in range(3):
-                        square += apart[i] * precision[i, j] * apart[j]
-                if square < least:
-                    least = square
+    for b in np.argsort(bound):
+        if bound[b] >= least:
+            break
+        x, y, z = _BLOCK * (b // (by * bz)), _BLOCK * (b // bz % by), _BLOCK * (b % bz)
+        for vx in range(x, min(x + _BLOCK, nx)):
+            for vy in range(y, min(y + _BLOCK, ny)):
+                for vz in range(z, min(z + _BLOCK, nz)):
+                    if not free[vx, vy, vz]:
+                        continue
+                    square = 0.0
+                    for i, n in enumerate((vx, vy, vz)):
+                        low = origin[i] + voxel_size * n
+                        apart[i] = min(max(position[i], low + inside), low + voxel_size - inside) - position[i]
                     for i in range(3):
-                        best[i] = apart[i]
+                        for j in range(3):
+                            square += apart[i] * precision[i, j] * apart[j]
+                    if square < least:
+                        least = square
+                        for i in range(3):
+                            best[i] = apart[i]
     if least == np.inf:
         return False
     for i in range(3):

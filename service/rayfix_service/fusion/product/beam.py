@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,18 @@ class Hypotheses:
     def __len__(self) -> int:
         """Return the number of hypotheses."""
         return len(self.log_weight)
+
+    def best(self, most: int) -> "Hypotheses":
+        """Give the best of them alone, at most so many."""
+        if len(self) <= most:
+            return self
+        return replace(
+            self,
+            log_weight=self.log_weight[:most],
+            mean=self.mean[:most],
+            cov=self.cov[:most],
+            outlier=self.outlier[:most],
+        )
 
 
 def multiply(

@@ -101,7 +101,13 @@ def make_factor(
         for kind in kinds
         for n, spread in enumerate(observation.angle_spreads)
     ]
-    taken = parts if most_considered is None else _within(parts, most_considered)
+    considered = bounds[-1] * len(kinds)
+    taken = parts
+    if most_considered is not None and considered > most_considered:
+        taken, considered = _within(parts, considered, most_considered)
+    most = settings.most_alternatives
+    if num_clocks:
+        most = int(most / math.sqrt(product_costs(3 + num_clocks)[0]))
     columns, outlier, omitted = make_alternatives(
         *join(heard),
         np.array(taken, PART),
@@ -113,14 +119,14 @@ def make_factor(
         log_bad + log_any_time - _log_angle_range(observation),
         math.log(settings.component_floor),
         settings.max_divergence,
-        int(settings.most_alternatives / math.sqrt(product_costs(3 + num_clocks)[0])),
+        most,
         stop.cell,
     )
     stop.check()
     return Factor(
         columns=columns,
         outlier=outlier,
-        considered=max(bounds[-1], _size(taken)),
+        considered=max(bounds[-1], considered),
         omitted=omitted > 0 or len(taken) < len(parts),
     )
 
@@ -129,19 +135,12 @@ _Part = tuple[int, int, int, float, float, float, float, int, int]
 """What becomes a record of :data:`PART`."""
 
 
-def _size(parts: list[_Part]) -> int:
-    """Return how many alternatives parts are of."""
-    return sum([stop - begin for _, begin, stop, *_ in parts])
-
-
-def _within(parts: list[_Part], most: int) -> list[_Part]:
+def _within(parts: list[_Part], size: int, most: int) -> tuple[list[_Part], int]:
     """Leave out the less probable combinations of errors until there are at most so many alternatives, or one is left.
 
     Alternatives whose times are outliers stay: they are what else a time may be that the combinations left do not fit.
+    Also gives how many alternatives there are then; ``size`` is how many there were.
     """
-    size = _size(parts)
-    if size <= most:
-        return parts
     good = sorted((n for n, part in enumerate(parts) if part[0] == ALL_GOOD), key=lambda n: parts[n][3])
     out = set[int]()
     for n in good[:-1]:
@@ -149,7 +148,7 @@ def _within(parts: list[_Part], most: int) -> list[_Part]:
             break
         out.add(n)
         size -= parts[n][2] - parts[n][1]
-    return [part for n, part in enumerate(parts) if n not in out]
+    return [part for n, part in enumerate(parts) if n not in out], size
 
 
 class _Kind(NamedTuple):
