@@ -20,8 +20,8 @@ from rayfix_service.fusion.measurements.observations import sort_report
 from rayfix_service.fusion.product.beam import multiply
 from rayfix_service.fusion.product.factors import Factor, make_factor
 from rayfix_service.fusion.product.information_form import unpack
-from rayfix_service.fusion.product.prior import Prior, even_prior
-from rayfix_service.fusion.product.station_mixture import HeardStation
+from rayfix_service.fusion.product.prior import Prior, uniform_prior
+from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.wire import parse_report
 from tests.support import kernel_twins
@@ -44,7 +44,7 @@ def main() -> None:
         count = math.ceil(options.reports / len(KINDS))
         drops = drop_uniformly(table, 2 * count, np.random.default_rng([options.seed, 0]))
         drops = [drop for drop in drops if len(drop.paths) > 1][:count]
-        stations = {name: HeardStation(part) for name, part in table.parts.items()}
+        stations = {name: StationMixtures(part) for name, part in table.parts.items()}
         print(f"{len(drops)} reports of each kind; changes of the log evidence [nats], of the mean [posterior's")
         print("deviations] and of the deviation [shares of it]")
         print("                       evidence                  mean                      deviation")
@@ -106,11 +106,11 @@ KINDS: list[tuple[str, Timing, float, Callable[[Measurements], Measurements]]] =
 
 
 def changes_of(
-    table: Any, stations: dict[str, HeardStation], report: dict[str, Any], drop: Drop, products: int
+    table: Any, stations: dict[str, StationMixtures], report: dict[str, Any], drop: Drop, products: int
 ) -> tuple[float, float, float]:
     """Tell how the beam changes the log evidence, the mean (in deviations) and the deviation (as a share)."""
     sorted_report = sort_report(parse_report(report), table.site)
-    prior, longest = even_prior(table.scene.free_space), table.site.max_path_length
+    prior, longest = uniform_prior(table.scene.free_space), table.site.max_path_length
     made = [
         make_factor(
             observation,

@@ -11,7 +11,7 @@ from benchmarks.costly_reports import random_measurement, random_report
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Height, Report
 from rayfix_service.fusion.posterior.fix import Fix
-from rayfix_service.fusion.posterior.modes import find_hills
+from rayfix_service.fusion.posterior.modes import find_modes
 from rayfix_service.fusion.posterior.voxels import nearest_free
 from rayfix_service.fusion.stopping import NEVER
 from rayfix_tables.errors import ReportError
@@ -91,7 +91,7 @@ def test_a_mode_far_from_all_free_space_is_told_where_that_begins() -> None:
     mean = np.array([[1.5, 1.5, 5.0], [4.0, 1.5, 1.5], [1.5, 1.5, 1.5]])
     cov = np.broadcast_to(0.01 * np.eye(3), (3, 3, 3)).copy()
     weight = np.array([0.5, 0.3, 0.2])
-    probability, position, moment, _ = find_hills(
+    probability, position, moment, _ = find_modes(
         np.log(weight), mean, cov, space.origin, space.voxel_size, free, NEVER.cell
     )
     np.testing.assert_allclose(probability, weight, rtol=0, atol=1e-12)

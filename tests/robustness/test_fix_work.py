@@ -193,7 +193,7 @@ def test_a_track_takes_in_a_bounded_number_of_hypotheses(locator: Locator) -> No
         mean=np.concatenate([some.mean, np.broadcast_to(some.mean[-1], (2000, 3))]),
         cov=np.concatenate([some.cov, np.broadcast_to(some.cov[-1], (2000, 3, 3))]),
         outlier=np.concatenate([some.outlier, np.broadcast_to(some.outlier[-1], (2000, some.outlier.shape[1]))]),
-        log_lost=some.log_lost,
+        log_all_outlier=some.log_all_outlier,
     )
     places = []
     for hypotheses in (many, many.best(512)):
@@ -311,8 +311,8 @@ def test_the_service_answers_while_the_costliest_reports_run(many_path: Path) ->
 
 
 def _idle(service: RunningApp) -> bool:
-    slow_fixes: Any = service.state.services.slow_fixes
-    return bool(slow_fixes.under_way == 0)
+    slow_work: Any = service.state.services.slow_work
+    return bool(slow_work.under_way == 0)
 
 
 def test_an_answer_says_what_was_left_out(many_path: Path) -> None:
@@ -346,8 +346,8 @@ def test_pictures_of_the_table_are_bounded_too(hall_table_path: Path) -> None:
         gate = threading.Event()
 
         async def together() -> list[httpx.Response]:
-            slow_fixes: Any = service.state.services.slow_fixes
-            held = asyncio.create_task(slow_fixes.run(lambda: gate.wait(30)))
+            slow_work: Any = service.state.services.slow_work
+            held = asyncio.create_task(slow_work.run(lambda: gate.wait(30)))
             await asyncio.sleep(0.02)
             try:
                 return [await service.http.get(mixture.format(1)), await service.http.get("/v1/stations/bs1/coverage")]

@@ -22,7 +22,7 @@ def location(target: str) -> dict[str, Any]:
 
 
 def told_by(
-    answers: Callable[[str], Answer], targets: list[str], *, patience: float = 20.0, **options: Any
+    answers: Callable[[str], Answer], targets: list[str], *, cooperation: float = 20.0, **options: Any
 ) -> tuple[Counter[str], list[str], float]:
     """Tell a hub, which answers each path in its own way, of targets.
 
@@ -48,7 +48,9 @@ def told_by(
             url=f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/v2", lanes=1, first_pause=0.01, **options
         )
         begin = loop.time()
-        async with open_hub(settings, on_outcome=lambda outcome: outcomes.update([outcome]), patience=patience) as hub:
+        async with open_hub(
+            settings, on_outcome=lambda outcome: outcomes.update([outcome]), cooperation=cooperation
+        ) as hub:
             assert hub is not None
             for target in targets:
                 hub.put(location(target))

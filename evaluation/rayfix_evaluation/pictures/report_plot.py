@@ -18,7 +18,7 @@ from rayfix_evaluation.pictures.plot import SceneFigure, draw_candidates, draw_t
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.directions import Direction, to_scene, without_bias
 from rayfix_service.fusion.measurements.report import Angle, Range, Report
-from rayfix_service.fusion.product.station_mixture import HeardStation
+from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_tables.table import Table
 
 Layer = Literal["rays", "points", "mixture", "posterior", "fix"]
@@ -115,7 +115,7 @@ def _station_mixture(
     table: Table, station_id: str, direction: Direction, length: Range | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Mixture over the position given one station's angle and time: weights, means (n, 3), covariances (n, 3, 3)."""
-    log_weight, mean, cov = HeardStation(table.parts[station_id]).towards(direction)
+    log_weight, mean, cov = StationMixtures(table.parts[station_id]).towards(direction)
     if length is not None:
         variance = cov[:, 3, 3] + length.stdev**2
         apart = length.path_length - table.parts[station_id].station.bias.range - mean[:, 3]

@@ -93,7 +93,7 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
                 if isinstance(outcome, str):
                     skipped.append(Skipped(path=(*path, *place), reason=outcome))
                 else:
-                    measurements.append(((*path, *place), _with_sight(outcome, item.los)))
+                    measurements.append(((*path, *place), _with_line_of_sight(outcome, item.los)))
             if len(measurements) + len(skipped) > 2 * MAX_RESULTS:  # each may be one range for every ue_rx_tx
                 text = (
                     f"ue_rx_tx makes more than {2 * MAX_RESULTS} measurements of the message's; give one for each TRP"
@@ -239,7 +239,7 @@ def _additional_paths(path: Path, value: UlRtoa | GnbRxTx) -> Iterator[tuple[Pat
         yield (*path, "ExtendedAdditionalPathList"), _MORE_PATHS
 
 
-def _with_sight(measurement: Angle | Range | TimeOfArrival, los: LosInformation | None) -> Measurement:
+def _with_line_of_sight(measurement: Angle | Range | TimeOfArrival, los: LosInformation | None) -> Measurement:
     """Add what the TRP says of a direct path; a hard indicator is a sure one."""
     if los is None:
         return measurement

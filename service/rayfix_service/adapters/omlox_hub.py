@@ -215,7 +215,7 @@ async def open_hub(
     settings: HubSettings | None,
     *,
     on_outcome: Callable[[HubOutcome], None] | None = None,
-    patience: float = 2.0,
+    cooperation: float = 2.0,
 ) -> AsyncIterator[OmloxHub | None]:
     """Send in the background while the context lasts, and what waits then for `patience` seconds more.
 
@@ -230,7 +230,7 @@ async def open_hub(
         yield hub
     finally:
         with suppress(TimeoutError):
-            async with asyncio.timeout(patience):
+            async with asyncio.timeout(cooperation):
                 while hub.num_waiting:
                     await asyncio.sleep(0.01)
         work.cancel()

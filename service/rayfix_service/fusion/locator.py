@@ -14,8 +14,8 @@ from rayfix_service.fusion.posterior.posterior import Posterior, make_posterior
 from rayfix_service.fusion.product.beam import Hypotheses, multiply
 from rayfix_service.fusion.product.cost import CostEstimate
 from rayfix_service.fusion.product.factors import Factor, make_factor
-from rayfix_service.fusion.product.prior import Prior, even_prior, height_prior
-from rayfix_service.fusion.product.station_mixture import HeardStation
+from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_prior
+from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.table import Table
@@ -47,8 +47,8 @@ class Locator:
     def __init__(self, table: Table, settings: FusionSettings | None = None) -> None:
         self.table = table
         self.settings = settings or FusionSettings()
-        self._even_prior = even_prior(table.scene.free_space)
-        self._stations = {name: HeardStation(part) for name, part in table.parts.items()}
+        self._uniform_prior = uniform_prior(table.scene.free_space)
+        self._stations = {name: StationMixtures(part) for name, part in table.parts.items()}
         largest = max((part.levels[-1].num_components for part in table.parts.values()), default=0)
         self._most_considered = max(self.settings.most_considered, self.settings.considered_tables * largest)
         self._cost = CostEstimate(self._stations, self.settings)
@@ -121,7 +121,7 @@ class Locator:
         """Multiply what the measurements say."""
         sorted_report = sort_report(report, self.table.site)
         free_space = self.table.scene.free_space
-        prior = self._even_prior if report.height is None else height_prior(report.height, free_space)
+        prior = self._uniform_prior if report.height is None else height_prior(report.height, free_space)
         unused = dict(sorted_report.unused)
         observations, factors = self._factors(sorted_report, prior, unused, stop)
         hypotheses = None
@@ -183,7 +183,7 @@ class Fused:
     """A fix, and the likelihood that it comes from.
 
     The probability density of the report at a place x is ``sum_h exp(log_weight_h) N(x; mean_h, cov_h) / prior(x)``,
-    and ``exp(log_lost)`` besides for the case that all measurements are outliers.
+    and ``exp(log_all_outlier)`` besides for the case that all measurements are outliers.
 
     Attributes
     ----------

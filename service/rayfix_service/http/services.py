@@ -9,8 +9,8 @@ from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.feed_relay import FeedRelay
 from rayfix_service.http.answering.locating import Answerer
 from rayfix_service.http.answering.served_tables import Tables
-from rayfix_service.http.answering.slow_work import SlowFixes
-from rayfix_service.http.answering.table_cache import PerTable
+from rayfix_service.http.answering.slow_work import SlowWork
+from rayfix_service.http.answering.table_cache import TableCache
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.telemetry.metrics import Metrics
 
@@ -27,9 +27,9 @@ class Services:
         Those that are served, ready or not.
     answerer : Answerer
         Locates reports.
-    slow_fixes : SlowFixes
+    slow_work : SlowWork
         Threads for what takes longer than the event loop may be held.
-    per_table : PerTable
+    table_cache : TableCache
         Results that follow from a table alone.
     feed : FixFeed
         Tells listeners of fixes.
@@ -41,8 +41,8 @@ class Services:
     metrics: Metrics
     tables: Tables
     answerer: Answerer
-    slow_fixes: SlowFixes
-    per_table: PerTable
+    slow_work: SlowWork
+    table_cache: TableCache
     feed: FixFeed
     relay: FeedRelay | None
 

@@ -25,8 +25,8 @@ from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.feed_relay import FeedRelay
 from rayfix_service.http.answering.locating import Answerer
 from rayfix_service.http.answering.served_tables import ServedTable, Tables
-from rayfix_service.http.answering.slow_work import SlowFixes
-from rayfix_service.http.answering.table_cache import PerTable
+from rayfix_service.http.answering.slow_work import SlowWork
+from rayfix_service.http.answering.table_cache import TableCache
 from rayfix_service.http.answering.table_checks import TableChecks
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.problems import Problem, install_problems
@@ -37,7 +37,7 @@ from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.telemetry.connections import NOTE
 from rayfix_service.http.telemetry.metrics import Metrics, forget_dead_workers
 from rayfix_service.http.telemetry.request_context import HEADER, RequestContext
-from rayfix_service.server.fast_path import ShortWay
+from rayfix_service.server.fast_path import FastPath
 from rayfix_service.server.stopping import on_stop_signal
 from rayfix_service.web import routes_assets, routes_scene, routes_simulation
 from rayfix_service.web.documents import SimulationRequest
@@ -147,7 +147,7 @@ def create_app(
         if settings.runtime_folder is not None:
             relay = FeedRelay(feed, settings.runtime_folder)
             keeping.append(asyncio.create_task(relay.keep()))
-        slow_fixes = SlowFixes(
+        slow_work = SlowWork(
             threads=settings.slow_fix_threads, waiting=settings.slow_fixes_waiting, seconds=settings.fix_seconds
         )
         stopping = asyncio.Event()
@@ -162,7 +162,7 @@ def create_app(
                     answerer = Answerer(
                         metrics=metrics,
                         feed=feed,
-                        slow_fixes=slow_fixes,
+                        slow_work=slow_work,
                         hub=hub,
                         quick_seconds=settings.quick_fix_seconds,
                     )
@@ -171,8 +171,8 @@ def create_app(
                         metrics=metrics,
                         tables=tables,
                         answerer=answerer,
-                        slow_fixes=slow_fixes,
-                        per_table=PerTable(),
+                        slow_work=slow_work,
+                        table_cache=TableCache(),
                         feed=feed,
                         relay=relay,
                     )
@@ -186,7 +186,7 @@ def create_app(
             for task in keeping:
                 task.cancel()
             await asyncio.wait(keeping)
-            slow_fixes.close()
+            slow_work.close()
 
     app = RayfixApp(
         title="rayfix",
@@ -200,7 +200,7 @@ def create_app(
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
     install_problems(app)
-    app.surround(ShortWay, path="/v1/positions", answer=partial(positions.answer_position, app.state))
+    app.surround(FastPath, path="/v1/positions", answer=partial(positions.answer_position, app.state))
     app.surround(Access, keys=keys, limit=_rate_limit(settings, accounts))
     if settings.cors_origins:
         # Around the access control, since a browser asks without a key whether it may send one.

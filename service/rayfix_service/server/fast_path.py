@@ -8,7 +8,7 @@ from rayfix_service.http.problems import ProblemError, error_response
 from rayfix_tables.errors import ReportError
 
 
-class ShortWay:
+class FastPath:
     """Middleware that answers one kind of request by itself: POST to a path, without a query.
 
     To find the route, to work out its parameters and to prepare for what it might need costs FastAPI a good part of

@@ -70,7 +70,7 @@ def likelihood_of(hypotheses: Hypotheses, prior: Prior, *, height_share: float) 
         log_scale += 0.5 * taken * from_known**2 - 0.5 * prior.eta * known
         slope[:, 2] = taken * from_known
     return Likelihood(
-        log_scale=np.append(log_scale, hypotheses.log_lost),
+        log_scale=np.append(log_scale, hypotheses.log_all_outlier),
         mean=np.concatenate([hypotheses.mean, np.zeros((1, 3))]),
         slope=np.concatenate([slope, np.zeros((1, 3))]),
         information=np.concatenate([information, np.zeros((1, 3, 3))]),

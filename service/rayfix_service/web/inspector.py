@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.lookup.lookup import look_up
 from rayfix_service.fusion.measurements.directions import Direction, in_field_of_view
-from rayfix_service.fusion.product.station_mixture import HeardStation
+from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_tables.level import Level
 from rayfix_tables.table import StationPart
 
@@ -73,13 +73,13 @@ def view_direction(part: StationPart, azimuth: float, zenith: float, stdev: floa
     """
     measured = Direction(azimuth=azimuth, zenith=zenith, cov=np.diag([stdev**2, stdev**2]))
     lookup = look_up(part.levels, measured)
-    heard = HeardStation(part).towards(measured)
+    mixture = StationMixtures(part).towards(measured)
     level = lookup.level
     begins, ends = level.cell_offsets[lookup.cells], level.cell_offsets[lookup.cells + 1]
     rows = np.concatenate([np.arange(begin, end) for begin, end in zip(begins, ends, strict=True)])
     reflections = level.mixture.num_reflections[rows].astype(np.int64)
-    log_evidence = float(np.logaddexp.reduce(heard.log_evidence, initial=-np.inf))
-    share = np.exp(heard.log_evidence - log_evidence) if len(heard) else np.empty(0)
+    log_evidence = float(np.logaddexp.reduce(mixture.log_evidence, initial=-np.inf))
+    share = np.exp(mixture.log_evidence - log_evidence) if len(mixture) else np.empty(0)
     top = np.argsort(-share, kind="stable")[:limit]
     return DirectionView(
         in_field_of_view=in_field_of_view(part.station, measured),
@@ -90,10 +90,10 @@ def view_direction(part: StationPart, azimuth: float, zenith: float, stdev: floa
         cell_components=ends - begins,
         log_evidence=log_evidence,
         probability=share[top],
-        position=heard.mean[top, :3],
-        position_cov=heard.cov[top, :3, :3],
-        path_length=heard.mean[top, 3],
-        path_length_stdev=np.sqrt(heard.cov[top, 3, 3]),
+        position=mixture.mean[top, :3],
+        position_cov=mixture.cov[top, :3, :3],
+        path_length=mixture.mean[top, 3],
+        path_length_stdev=np.sqrt(mixture.cov[top, 3, 3]),
         num_reflections=reflections[top],
         by_reflections=np.bincount(reflections, weights=share).astype(np.float64),
     )
@@ -103,7 +103,7 @@ def mass_by_reflections(level: Level) -> NDArray[np.float64]:
     """Share of a level's mass by the number of reflections of its components, shape (k,), summing to 1.
 
     The mass of a cell is the integral of its measure: volume of free space, weighted by how probably a UE there is
-    heard from that direction.
+    reported from that direction.
     """
     counts = np.diff(level.cell_offsets)
     log_mass = np.repeat(level.cell_log_mass, counts) + level.mixture.log_weight

@@ -46,7 +46,7 @@ async def get_scene(request: Request, services: ServicesDep, served: TableDep) -
     headers = {"ETag": tag, "Cache-Control": "no-cache"}
     if request.headers.get("if-none-match") == tag:
         return Response(status_code=304, headers=headers)
-    body = await services.per_table.get(table.table_id, "scene.glb", lambda: write_glb(table.scene, table.site.name))
+    body = await services.table_cache.get(table.table_id, "scene.glb", lambda: write_glb(table.scene, table.site.name))
     return Response(body, media_type=MEDIA_TYPE, headers=headers)
 
 
@@ -80,7 +80,7 @@ async def get_mixture(
         return mixture_document(station_id, view_direction(part, azimuth, zenith, stdev, limit=limit))
 
     charge_report(request)
-    return JSONResponse(await services.slow_fixes.run(view))
+    return JSONResponse(await services.slow_work.run(view))
 
 
 @router.get(
@@ -99,8 +99,8 @@ async def get_coverage(
     table = served.locator.table
     part = _part(table, station_id)
     charge_report(request)
-    document = await services.per_table.get(
-        table.table_id, f"coverage of {station_id}", lambda: _coverage(station_id, part), run=services.slow_fixes.run
+    document = await services.table_cache.get(
+        table.table_id, f"coverage of {station_id}", lambda: _coverage(station_id, part), run=services.slow_work.run
     )
     return JSONResponse(document)
 

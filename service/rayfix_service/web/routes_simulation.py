@@ -68,7 +68,7 @@ async def post_simulation(request: Request, services: ServicesDep, served: Table
             FORBIDDEN, "this service does not simulate; start it with --allow-simulation, or listen on loopback"
         )
     wanted = parse_simulation(body)
-    return JSONResponse(await services.slow_fixes.locate(_on(served.locator, _simulate_and_locate), wanted))
+    return JSONResponse(await services.slow_work.locate(_on(served.locator, _simulate_and_locate), wanted))
 
 
 @router.post(
@@ -80,7 +80,7 @@ async def post_simulation(request: Request, services: ServicesDep, served: Table
 )
 async def post_posterior(request: Request, services: ServicesDep, served: TableDep, body: ReportBody) -> JSONResponse:
     """Give the Gaussians of the posterior and positions drawn from it, for pictures."""
-    return JSONResponse(await services.slow_fixes.locate(_on(served.locator, picture_posterior), parse_report(body)))
+    return JSONResponse(await services.slow_work.locate(_on(served.locator, picture_posterior), parse_report(body)))
 
 
 class _Work(Protocol[Asked_contra]):

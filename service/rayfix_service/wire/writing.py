@@ -49,7 +49,7 @@ def report_to_document(report: Report) -> dict[str, Any]:
 def _measurement(measurement: Measurement) -> dict[str, Any]:
     match measurement:
         case Angle():
-            return _angle(measurement) | _sight(measurement)
+            return _angle(measurement) | _line_of_sight(measurement)
         case LogRange():
             return _signal_strength(measurement)
         case TimeDifference():
@@ -65,14 +65,14 @@ def _measurement(measurement: Measurement) -> dict[str, Any]:
             document = {
                 "type": "pt",
                 "station_id": measurement.station_id,
-                **_sight(measurement),
+                **_line_of_sight(measurement),
                 **_range(measurement),
             }
         case TimeOfArrival():
             document = {
                 "type": "toa",
                 "station_id": measurement.station_id,
-                **_sight(measurement),
+                **_line_of_sight(measurement),
                 **_length("range_m", "delay_ns", measurement.path_length, measurement.stdev),
             }
     return document | _error_model(measurement.error_model)
@@ -162,7 +162,7 @@ def _error_model(model: ErrorModel) -> dict[str, Any]:
     return {"error_model": "heavy_tailed", "tail_share": model.tail_share, "tail_scale": model.tail_scale}
 
 
-def _sight(measurement: Angle | Range | TimeOfArrival) -> dict[str, Any]:
+def _line_of_sight(measurement: Angle | Range | TimeOfArrival) -> dict[str, Any]:
     return {} if measurement.los_probability is None else {"los_probability": measurement.los_probability}
 
 

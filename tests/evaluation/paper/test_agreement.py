@@ -19,7 +19,7 @@ from rayfix_service.fusion.measurements.report import Angle, Measurement, Range,
 from rayfix_service.fusion.product import beam
 from rayfix_service.fusion.product.factors import make_factor
 from rayfix_service.fusion.product.prior import Prior
-from rayfix_service.fusion.product.station_mixture import HeardStation
+from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.angles import angles_of
 from rayfix_tables.table import Table
@@ -59,7 +59,7 @@ def closed_form(table: Table, *measurements: Measurement) -> tuple[Array, Array]
     limits = {"max_path_length": table.site.max_path_length, "prior": Prior(log_volume=float(np.log(60.0)))}
     factors = []
     for observation in sorted_report.observations:
-        station = HeardStation(table.parts[observation.station_id])
+        station = StationMixtures(table.parts[observation.station_id])
         factor = make_factor(observation, station, num_clocks=sorted_report.num_clocks, settings=NO_OUTLIERS, **limits)
         assert factor is not None
         factors.append(factor)

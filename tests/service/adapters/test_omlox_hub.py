@@ -70,7 +70,7 @@ def push(
     outcomes: Counter[str] = Counter()
 
     async def scenario() -> None:
-        async with open_hub(settings, on_outcome=lambda outcome: outcomes.update([outcome]), patience=5.0) as sender:
+        async with open_hub(settings, on_outcome=lambda outcome: outcomes.update([outcome]), cooperation=5.0) as sender:
             assert sender is not None
             for one in locations:
                 sender.put(one)
@@ -131,7 +131,7 @@ def test_at_the_end_patience_is_short(hub: Hub):
 
     async def scenario() -> float:
         loop = asyncio.get_running_loop()
-        async with open_hub(HubSettings(url=hub.url), patience=0.1) as sender:
+        async with open_hub(HubSettings(url=hub.url), cooperation=0.1) as sender:
             assert sender is not None
             sender.put(location("a"))
             begin = loop.time()

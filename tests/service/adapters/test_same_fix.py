@@ -80,10 +80,10 @@ def assert_same(fix: Fix, native: Fix) -> None:
     assert len(fix.candidates) == len(native.candidates)
 
 
-Sight = dict[str, tuple[float, float, float]]
+LineOfSightWeights = dict[str, tuple[float, float, float]]
 
 
-def test_nrppa(locator: Locator, sight: Sight):
+def test_nrppa(locator: Locator, sight: LineOfSightWeights):
     trps, decoded, exact = [], [], []
     for trp_id, (station_id, (azimuth, zenith, distance)) in enumerate(sight.items(), 1):
         azimuth_value = math.floor((azimuth - NORTH_DEG) % 360 * 10)
@@ -129,7 +129,7 @@ def test_nrppa(locator: Locator, sight: Sight):
     assert np.linalg.norm(position(fix) - unrounded) < 0.05
 
 
-def test_silabs(locator: Locator, sight: Sight):
+def test_silabs(locator: Locator, sight: LineOfSightWeights):
     angles, native = [], []
     for station_id, (azimuth, zenith, distance) in sight.items():
         angles.append(
@@ -152,7 +152,7 @@ def test_silabs(locator: Locator, sight: Sight):
     assert_same(locate(locator, document, "silabs"), locate(locator, {"measurements": native}, "native"))
 
 
-def test_ublox(locator: Locator, sight: Sight):
+def test_ublox(locator: Locator, sight: LineOfSightWeights):
     lines, decoded = [], []
     for station_id, (azimuth, zenith, _) in sight.items():
         right, up = round(BEARING_DEG[station_id] - azimuth), round(90 - zenith)
@@ -165,7 +165,7 @@ def test_ublox(locator: Locator, sight: Sight):
     assert np.linalg.norm(position(fix) - position(locate(locator, {"measurements": exact}, "native"))) < 0.15
 
 
-def test_the_fix_is_near_the_target(locator: Locator, sight: Sight):
+def test_the_fix_is_near_the_target(locator: Locator, sight: LineOfSightWeights):
     """So that a mistake that all formats share would show: 1 deg at 9 m is 16 cm, three stations.
 
     With this noise, a place a metre away by way of a reflection is about as probable.

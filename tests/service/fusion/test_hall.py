@@ -27,8 +27,8 @@ from rayfix_service.fusion.product.beam import multiply
 from rayfix_service.fusion.product.factor_kernels import TIME_OUTLIER
 from rayfix_service.fusion.product.factors import Factor, make_factor
 from rayfix_service.fusion.product.information_form import unpack
-from rayfix_service.fusion.product.prior import Prior, even_prior
-from rayfix_service.fusion.product.station_mixture import HeardStation
+from rayfix_service.fusion.product.prior import Prior, uniform_prior
+from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.wire import parse_report
 from rayfix_tables.angles import angles_of, direction, local_to_scene
@@ -109,7 +109,7 @@ def factors_of(hall: Hall, report: Report, most: int, place: Array) -> tuple[lis
     for observation in sorted_report.observations:
         factor = make_factor(
             observation,
-            HeardStation(hall.table.parts[observation.station_id]),
+            StationMixtures(hall.table.parts[observation.station_id]),
             num_clocks=sorted_report.num_clocks,
             max_path_length=hall.table.site.max_path_length,
             prior=Prior(log_volume=log_volume),
@@ -165,7 +165,7 @@ def test_the_beam_finds_what_the_exhaustive_product_finds(hall: Hall, timing: Ti
             multiply,
             factors,
             max_path_length=hall.table.site.max_path_length,
-            prior=even_prior(hall.table.scene.free_space),
+            prior=uniform_prior(hall.table.scene.free_space),
         )
         whole = products(width=len(log_weight) + 1, max_divergence=0.0)
         # What the beam gives up is 20 nats below the best before the last factor is known.
@@ -204,8 +204,8 @@ def test_a_wider_beam_without_merging_gives_the_same_fix(hall: Hall, timing: Tim
         drawn = posterior.sample(300, np.random.default_rng(n))
         lost = posterior.log_density(drawn) - hall.locator.posterior(report).log_density(drawn)
         assert lost.mean() < 0.05  # nats
-        hills = [sum(candidate.probability > 0.03 for candidate in one.candidates) for one in (fix, expected)]
-        if hills[0] == hills[1]:
+        modes = [sum(candidate.probability > 0.03 for candidate in one.candidates) for one in (fix, expected)]
+        if modes[0] == modes[1]:
             same_hills += 1
             assert fix.status == expected.status
             assert best(fix).probability == pytest.approx(best(expected).probability, abs=0.04)

@@ -21,7 +21,7 @@ from rayfix_service.fusion.product import beam_kernels, factor_kernels, informat
 from rayfix_service.fusion.product.factor_kernels import ALL_GOOD
 from rayfix_service.fusion.product.factors import make_factor
 from rayfix_service.fusion.product.prior import Prior
-from rayfix_service.fusion.product.station_mixture import HeardStation
+from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER
 from rayfix_tables.freespace import FreeSpace
@@ -325,7 +325,7 @@ def test_a_balance_is_added_to_its_own_components() -> None:
     raised = replace(part, levels=(replace(level, log_balance=balance),))
     azimuth, zenith = level.grid.centres[12]
     measured = Direction(azimuth=float(azimuth), zenith=float(zenith), cov=0.05**2 * np.eye(2))
-    before, after = HeardStation(part).towards(measured), HeardStation(raised).towards(measured)
+    before, after = StationMixtures(part).towards(measured), StationMixtures(raised).towards(measured)
     np.testing.assert_allclose(after.log_evidence - before.log_evidence, balance, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(after.mean, before.mean)
     np.testing.assert_array_equal(after.cov, before.cov)
@@ -399,7 +399,7 @@ def test_closed_form_conditioning_agrees_with_sampling(seed: int, error: str) ->
     fusion = FusionSettings(component_floor=1e-12, max_divergence=0.0)
     prior = Prior(log_volume=LOG_VOLUME)
     factor = make_factor(
-        observation, HeardStation(part), num_clocks=0, max_path_length=60.0, prior=prior, settings=fusion
+        observation, StationMixtures(part), num_clocks=0, max_path_length=60.0, prior=prior, settings=fusion
     )
     assert factor is not None
     information, eta, log_scale = information_form.unpack(factor.columns[:, factor.outlier == ALL_GOOD])

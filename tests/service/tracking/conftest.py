@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rayfix_service.fusion.locator import Fused
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.product.beam import Hypotheses
-from rayfix_service.fusion.product.prior import Prior, even_prior
+from rayfix_service.fusion.product.prior import Prior, uniform_prior
 from rayfix_service.tracking.likelihood import Likelihood, likelihood_of
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Scene
@@ -44,7 +44,7 @@ def hypotheses_of(
     means: Sequence[Sequence[float]],
     stdev: float = 0.1,
     probabilities: Sequence[float] | None = None,
-    log_lost: float = -50.0,
+    log_all_outlier: float = -50.0,
 ) -> Hypotheses:
     """Make round Gaussians of which the log weights are the logarithms of the probabilities."""
     count = len(means)
@@ -54,7 +54,7 @@ def hypotheses_of(
         mean=np.array(means, np.float64),
         cov=np.tile(stdev**2 * np.eye(3), (count, 1, 1)),
         outlier=np.zeros((count, 1), np.int8),
-        log_lost=log_lost,
+        log_all_outlier=log_all_outlier,
     )
 
 
@@ -68,7 +68,7 @@ def fused_of(
     """Make a report's product with a fix that holds no more than the tracker asks for."""
     log_evidence = 0.0
     if hypotheses is not None:
-        log_evidence = float(np.logaddexp.reduce([*hypotheses.log_weight, hypotheses.log_lost]))
+        log_evidence = float(np.logaddexp.reduce([*hypotheses.log_weight, hypotheses.log_all_outlier]))
     fix = Fix(
         status="ok",
         candidates=(),
@@ -78,7 +78,7 @@ def fused_of(
         target_id=target,
         timestamp=timestamp,
     )
-    return Fused(fix=fix, hypotheses=hypotheses, prior=prior or even_prior(FREE))
+    return Fused(fix=fix, hypotheses=hypotheses, prior=prior or uniform_prior(FREE))
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ def make_hypotheses() -> Callable[..., Hypotheses]:
 @pytest.fixture
 def even_likelihood() -> Callable[..., Likelihood]:
     """Return the function that makes likelihoods from what :func:`hypotheses_of` takes."""
-    return lambda *a: likelihood_of(hypotheses_of(*a), even_prior(FREE), height_share=0.0)
+    return lambda *a: likelihood_of(hypotheses_of(*a), uniform_prior(FREE), height_share=0.0)
 
 
 @pytest.fixture

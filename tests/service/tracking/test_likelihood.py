@@ -6,7 +6,7 @@ from scipy.stats import multivariate_normal
 
 from rayfix_service.fusion.measurements.report import Height
 from rayfix_service.fusion.product.beam import Hypotheses
-from rayfix_service.fusion.product.prior import even_prior, height_prior
+from rayfix_service.fusion.product.prior import height_prior, uniform_prior
 from rayfix_service.tracking.likelihood import likelihood_of
 from rayfix_tables.freespace import FreeSpace
 
@@ -23,7 +23,7 @@ def random_hypotheses(rng: np.random.Generator, count: int = 4) -> Hypotheses:
         mean=rng.normal(scale=2.0, size=(count, 3)),
         cov=np.linalg.inv(precision),
         outlier=np.zeros((count, 1), np.int8),
-        log_lost=-7.0,
+        log_all_outlier=-7.0,
     )
 
 
@@ -31,14 +31,14 @@ def random_hypotheses(rng: np.random.Generator, count: int = 4) -> Hypotheses:
 def test_times_the_prior_it_is_the_product(known: bool, free_space: FreeSpace):
     rng = np.random.default_rng(3)
     hypotheses = random_hypotheses(rng)
-    prior = height_prior(HEIGHT, free_space) if known else even_prior(free_space)
+    prior = height_prior(HEIGHT, free_space) if known else uniform_prior(free_space)
     points = rng.normal(scale=2.0, size=(50, 3))
     log_prior = prior.eta * points[:, 2] - 0.5 * prior.precision * points[:, 2] ** 2 - prior.log_volume
     product = sum(
         np.exp(w) * multivariate_normal(m, c).pdf(points)
         for w, m, c in zip(hypotheses.log_weight, hypotheses.mean, hypotheses.cov, strict=True)
     )
-    expected = np.log(product + np.exp(hypotheses.log_lost + log_prior))
+    expected = np.log(product + np.exp(hypotheses.log_all_outlier + log_prior))
     found = likelihood_of(hypotheses, prior, height_share=0.0).log_density(points) + log_prior
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
@@ -49,6 +49,6 @@ def test_what_is_left_of_the_height_weighs_by_the_distance_from_it(free_space: F
     points = rng.normal(size=(20, 3))
     prior = height_prior(HEIGHT, free_space)
     without, some = (likelihood_of(hypotheses, prior, height_share=s).log_density(points) for s in (0.0, 0.25))
-    lost = np.exp(hypotheses.log_lost)  # says nothing of the height either way
+    lost = np.exp(hypotheses.log_all_outlier)  # says nothing of the height either way
     ratio = np.log(np.exp(some) - lost) - np.log(np.exp(without) - lost)
     np.testing.assert_allclose(ratio, -0.25 * 0.5 * ((points[:, 2] - HEIGHT.z) / HEIGHT.stdev) ** 2, atol=1e-8)

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from rayfix_service.fusion.measurements.report import Height
 from rayfix_service.fusion.product.beam import Hypotheses
-from rayfix_service.fusion.product.prior import Prior, even_prior, height_prior
+from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_prior
 from rayfix_service.tracking.likelihood import Likelihood, likelihood_of
 from rayfix_service.tracking.motion import MotionModel
 from rayfix_service.tracking.particles import Particles, birth, mixed, predict, update
@@ -39,7 +39,7 @@ def test_an_update_is_a_kalman_filters(
     seen, noise, t = np.array([1.4, 1.9, 3.2]), 0.15, 0.8
     found = update(particles, even_likelihood([seen.tolist()], noise), MODEL, t, walls_of(open_scene), rng)
     assert found is not None
-    log_evidence = even_prior(free_space).log_volume
+    log_evidence = uniform_prior(free_space).log_volume
     for axis, v in enumerate(particles.velocity_variance):
         transition = np.array([[1.0, t], [0.0, 1.0]])
         q = MODEL.density[axis] * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
@@ -74,7 +74,7 @@ def test_hypotheses_share_particles_by_their_evidence(
         ]
     )
     assert (found.particles.position[:, 0] < 0.15).mean() == pytest.approx(weight[0] / weight.sum(), abs=0.03)
-    expected = np.log(weight.sum()) + even_prior(free_space).log_volume
+    expected = np.log(weight.sum()) + uniform_prior(free_space).log_volume
     assert found.log_evidence == pytest.approx(expected, abs=0.03)
 
 
@@ -83,9 +83,14 @@ def test_a_report_of_outliers_alone_leaves_the_prediction(
 ):
     rng = np.random.default_rng(3)
     particles = cloud(rng, [0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
-    far = make_hypotheses([[25.0, 25.0, 25.0]], 0.1, log_lost=-4.0)
+    far = make_hypotheses([[25.0, 25.0, 25.0]], 0.1, log_all_outlier=-4.0)
     found = update(
-        particles, likelihood_of(far, even_prior(free_space), height_share=0.0), MODEL, 0.5, walls_of(open_scene), rng
+        particles,
+        likelihood_of(far, uniform_prior(free_space), height_share=0.0),
+        MODEL,
+        0.5,
+        walls_of(open_scene),
+        rng,
     )
     assert found is not None
     assert found.log_evidence == pytest.approx(-4.0, abs=1e-9)
@@ -99,7 +104,7 @@ def test_the_known_height_counts_as_its_share(
     rng = np.random.default_rng(4)
     particles = cloud(rng, [0.0, 0.0, 1.0], [0.0, 0.0, 0.0])
     prior: Prior = height_prior(Height(z=1.2, stdev=0.3), free_space)
-    hypotheses = make_hypotheses([[0.0, 0.0, 1.2]], 0.3, log_lost=-60.0)
+    hypotheses = make_hypotheses([[0.0, 0.0, 1.2]], 0.3, log_all_outlier=-60.0)
     hypotheses.cov[:] = np.diag([1e6, 1e6, 0.3**2])  # as wide as nothing, but for the height
     t = 0.5
     for share in (0.0, 1.0):

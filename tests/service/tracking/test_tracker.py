@@ -249,9 +249,9 @@ def test_whatever_comes_in_whatever_order_a_track_is_sound(
 ):
     tracker = Tracker(sheet_scene, TrackingSettings(max_targets=3, num_particles=64))
     latest: dict[str, datetime] = {}
-    for seconds, target, places, stdev, log_lost in reports:
+    for seconds, target, places, stdev, log_all_outlier in reports:
         moment = datetime(2026, 1, 31, 10, tzinfo=UTC) + timedelta(seconds=seconds)
-        hypotheses = None if places is None else make_hypotheses(places, stdev, None, log_lost)
+        hypotheses = None if places is None else make_hypotheses(places, stdev, None, log_all_outlier)
         track = tracker.follow(make_fused(hypotheses, target=target, timestamp=moment.isoformat()))
         assert len(tracker) <= 3
         if track is None:

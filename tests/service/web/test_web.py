@@ -14,7 +14,7 @@ import trimesh
 
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.http.answering.table_cache import PerTable
+from rayfix_service.http.answering.table_cache import TableCache
 from rayfix_service.web import assets
 from rayfix_service.web.documents import MixtureDocument, mixture_document
 from rayfix_service.web.glb import NO_MATERIAL, write_glb
@@ -292,7 +292,7 @@ def test_without_built_files_there_are_no_assets(tmp_path: Path):
 
 def test_results_of_tables_are_computed_once():
     async def ask() -> list[int]:
-        kept, calls = PerTable(most=2), []
+        kept, calls = TableCache(most=2), []
         for name in ("a", "a", "b", "c", "a"):
             await kept.get("table", name, lambda name=name: calls.append(name))
         return [calls.count(name) for name in "abc"]

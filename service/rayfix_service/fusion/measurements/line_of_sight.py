@@ -18,17 +18,17 @@ _JUDGED = (Angle, Range, TimeOfArrival)
 """Measurements of which a receiver may say whether their path is direct."""
 
 
-class Sight(NamedTuple):
+class LineOfSightWeights(NamedTuple):
     """Logarithms of what the weights of direct and of reflected paths are multiplied by."""
 
     log_direct: float
     log_reflected: float
 
 
-def sight(los_probability: float, least_error: float) -> Sight:
+def line_of_sight_weights(los_probability: float, least_error: float) -> LineOfSightWeights:
     """Weigh a judgement that is wrong with a probability of ``least_error`` at least, however sure it seems."""
     probability = min(max(los_probability, least_error), 1.0 - least_error)
-    return Sight(math.log(2.0 * probability), math.log(2.0 * (1.0 - probability)))
+    return LineOfSightWeights(math.log(2.0 * probability), math.log(2.0 * (1.0 - probability)))
 
 
 def los_probability(measurements: Iterable[Measurement]) -> float | None:

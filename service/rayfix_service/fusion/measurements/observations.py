@@ -176,11 +176,11 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
         num_clocks = read.num_clocks
     observations = [observation for draft in drafts.values() for observation in _observations(draft)]
     if los_probability(report.measurements) is not None:
-        observations = [_with_sight(observation, report) for observation in observations]
+        observations = [_with_line_of_sight(observation, report) for observation in observations]
     return SortedReport(tuple(observations), num_clocks, unused)
 
 
-def _with_sight(observation: Observation, report: Report) -> Observation:
+def _with_line_of_sight(observation: Observation, report: Report) -> Observation:
     places = (observation.angle_index, *observation.timing_indices)
     said = los_probability(report.measurements[place] for place in places if place is not None)
     return observation._replace(los_probability=said)

@@ -10,7 +10,7 @@ from rayfix_service.fusion.posterior.credible import CredibleRegions
 from rayfix_service.fusion.posterior.fix import Candidate, Fix, Outcome, Status
 from rayfix_service.fusion.posterior.summary import sum_up
 from rayfix_service.fusion.product.beam import Hypotheses
-from rayfix_service.fusion.product.outliers import culprits
+from rayfix_service.fusion.product.outliers import outlier_index
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
@@ -67,9 +67,9 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
     status: Status = "insufficient"
     hypotheses = product.hypotheses
     if hypotheses is not None:
-        found = culprits(product.observations)
+        found = outlier_index(product.observations)
         if not len(hypotheses):
-            log_evidence, status = hypotheses.log_lost, "inconsistent"
+            log_evidence, status = hypotheses.log_all_outlier, "inconsistent"
             outlier = dict.fromkeys(found.places, 1.0)
         else:
             summary = sum_up(hypotheses, found, table.scene.free_space, settings.hypothesis_floor, stop)

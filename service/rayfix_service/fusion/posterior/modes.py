@@ -16,7 +16,7 @@ _SAME_HILL = 9.0
 
 
 @numba.njit(cache=True, nogil=True)
-def find_hills(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any, stop: Any) -> Any:
+def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any, stop: Any) -> Any:
     """Climb from Gaussians to the modes of their mixture, gather them by the hill they belong to, sum each hill up.
 
     Parameters
@@ -88,7 +88,7 @@ def _second_moments(weight: Any, mean: Any, cov: Any, member: Any, total: Any, p
 
 
 @numba.njit(cache=True, nogil=True)
-def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any, stop: Any) -> Any:
+def gather(log_density: Any, mean: Any, precision: Any, same_mode: Any, stop: Any) -> Any:
     """Climb from each hypothesis, the densest first, and gather the hypotheses by the hill they come to.
 
     Parameters
@@ -97,7 +97,7 @@ def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any, stop: An
         Log weight plus half the log determinant of the precision.
     mean : ndarray of shape (h, 3), m
     precision : ndarray of shape (h, 3, 3), 1 / m2
-    same_hill : float
+    same_mode : float
         Two modes are one hill, though with two humps, when their squared distance is below this in what either is
         uncertain by.
     stop : ndarray of uint8, shape (1,)
@@ -118,18 +118,18 @@ def gather(log_density: Any, mean: Any, precision: Any, same_hill: Any, stop: An
     for h in np.argsort(-log_density):
         if stop[0] != 0 and found > 0:
             break
-        mode, here, hill = climb(log_density, mean, precision, mean[h], top[:found], curvature[:found])
+        mode, here, mode = climb(log_density, mean, precision, mean[h], top[:found], curvature[:found])
         for n in range(found):
-            if hill >= 0:
+            if mode >= 0:
                 break
-            if min(_square(mode, top[n], curvature[n]), _square(mode, top[n], here)) < same_hill:
-                hill = n
-        if hill < 0:
-            hill = found
+            if min(_square(mode, top[n], curvature[n]), _square(mode, top[n], here)) < same_mode:
+                mode = n
+        if mode < 0:
+            mode = found
             top[found] = mode
             curvature[found] = here
             found += 1
-        member[h] = hill
+        member[h] = mode
     return top[:found].copy(), member
 
 

@@ -169,17 +169,17 @@ def make_posterior(hypotheses: Hypotheses | None, prior: Prior, free_space: Free
             prior_share=1.0,
             prior=prior,
             free_space=free_space,
-            log_evidence=0.0 if hypotheses is None else hypotheses.log_lost,
+            log_evidence=0.0 if hypotheses is None else hypotheses.log_all_outlier,
         )
     share = free_shares(hypotheses.mean, hypotheses.cov, free_space, stop)
     keep = share > 0.0
     log_weight = hypotheses.log_weight[keep]
-    log_evidence = float(np.logaddexp.reduce([*(log_weight + np.log(share[keep])), hypotheses.log_lost]))
+    log_evidence = float(np.logaddexp.reduce([*(log_weight + np.log(share[keep])), hypotheses.log_all_outlier]))
     return Posterior(
         log_weight=log_weight - log_evidence,
         mean=hypotheses.mean[keep],
         cov=hypotheses.cov[keep],
-        prior_share=min(1.0, float(np.exp(hypotheses.log_lost - log_evidence))),
+        prior_share=min(1.0, float(np.exp(hypotheses.log_all_outlier - log_evidence))),
         prior=prior,
         free_space=free_space,
         log_evidence=log_evidence,

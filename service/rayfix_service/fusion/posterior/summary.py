@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.posterior.cholesky import log_sum
 from rayfix_service.fusion.posterior.cut_by_walls import cut_to_free_space
-from rayfix_service.fusion.posterior.modes import find_hills
+from rayfix_service.fusion.posterior.modes import find_modes
 from rayfix_service.fusion.posterior.points import DrawnPoints, draw_points
 from rayfix_service.fusion.product.beam import Hypotheses
-from rayfix_service.fusion.product.outliers import Culprits, outlier_probabilities
+from rayfix_service.fusion.product.outliers import OutlierIndex, outlier_probabilities
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.normal_points import normal_points, unit_points
@@ -53,7 +53,7 @@ class Summary(NamedTuple):
 
 
 def sum_up(
-    hypotheses: Hypotheses, culprits: Culprits, free_space: FreeSpace, floor: float, stop: Stop = NEVER
+    hypotheses: Hypotheses, outlier_index: OutlierIndex, free_space: FreeSpace, floor: float, stop: Stop = NEVER
 ) -> Summary:
     """Sum hypotheses up, cut to the free space.
 
@@ -71,14 +71,14 @@ def sum_up(
     FixStoppedError
         When it was.
     """
-    log_evidence, lost, hills, outlier, half_bad, drawn = _sum_up(
+    log_evidence, lost, modes, outlier, half_bad, drawn = _sum_up(
         hypotheses.log_weight,
         hypotheses.mean,
         hypotheses.cov,
         hypotheses.outlier,
-        hypotheses.log_lost,
-        culprits.rows,
-        len(culprits.places),
+        hypotheses.log_all_outlier,
+        outlier_index.rows,
+        len(outlier_index.places),
         math.log(floor),
         unit_points(),
         normal_points(_NUM_POINTS),
@@ -88,7 +88,7 @@ def sum_up(
         stop.cell,
     )
     stop.check()
-    probability, position, moment = hills
+    probability, position, moment = modes
     mean, root, owner = drawn
     points = DrawnPoints(mean=mean, root=root, owner=owner)
     return Summary(log_evidence, lost, probability, position, moment, outlier, half_bad, points)
@@ -100,7 +100,7 @@ def _sum_up(
     mean: Any,
     cov: Any,
     outlier: Any,
-    log_lost: Any,
+    log_all_outlier: Any,
     rows: Any,
     count: Any,
     log_floor: Any,
@@ -114,12 +114,12 @@ def _sum_up(
     """Give the entries of a :class:`Summary`; ``unit`` and ``normal`` are points that stand for a standard normal."""
     log_cut, cut_mean, cut_cov = cut_to_free_space(log_weight, mean, cov, unit, origin, voxel_size, free)
     log_found = log_sum(log_cut)
-    log_evidence = np.logaddexp(log_found, log_lost)
-    lost = np.exp(log_lost - log_evidence)
+    log_evidence = np.logaddexp(log_found, log_all_outlier)
+    lost = np.exp(log_all_outlier - log_evidence)
     log_cut -= log_found
     keep = np.flatnonzero(log_cut > log_floor)
     kept = log_cut[keep], cut_mean[keep], cut_cov[keep]
-    probability, position, moment, _ = find_hills(*kept, origin, voxel_size, free, stop)
+    probability, position, moment, _ = find_modes(*kept, origin, voxel_size, free, stop)
     weight = (1.0 - lost) * np.exp(log_cut)
     totals, half_bad = outlier_probabilities(outlier, weight, lost, rows, count)
     drawn = draw_points(log_weight, mean, cov, normal, origin, voxel_size, free)

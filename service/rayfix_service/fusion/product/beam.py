@@ -29,7 +29,7 @@ class Hypotheses:
     cov : ndarray of shape (h, 3, 3), m2
     outlier : ndarray of int8, shape (h, n_factors)
         What the hypothesis takes for an outlier in each factor.
-    log_lost : float
+    log_all_outlier : float
         Log evidence of the hypothesis that all factors are outliers, which is none of the above.
     omitted : int
         Hypotheses that were left out because there were too many products to form.
@@ -39,7 +39,7 @@ class Hypotheses:
     mean: NDArray[np.float64]
     cov: NDArray[np.float64]
     outlier: NDArray[np.int8]
-    log_lost: float
+    log_all_outlier: float
     omitted: int = 0
 
     def __len__(self) -> int:
@@ -96,7 +96,7 @@ def multiply(
     columns = np.concatenate([factor.columns for factor in factors], axis=1)
     outlier = np.concatenate([factor.outlier for factor in factors])
     offsets = np.array([0, *itertools.accumulate([len(factor) for factor in factors])])
-    log_weight, mean, cov, outlier, log_lost, omitted = multiply_factors(
+    log_weight, mean, cov, outlier, log_all_outlier, omitted = multiply_factors(
         columns,
         outlier,
         offsets,
@@ -110,4 +110,6 @@ def multiply(
         stop.cell,
     )
     stop.check()
-    return Hypotheses(log_weight=log_weight, mean=mean, cov=cov, outlier=outlier, log_lost=log_lost, omitted=omitted)
+    return Hypotheses(
+        log_weight=log_weight, mean=mean, cov=cov, outlier=outlier, log_all_outlier=log_all_outlier, omitted=omitted
+    )

@@ -61,7 +61,7 @@ def multiply_factors(
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
     outlier : ndarray of int8, shape (h, n)
-    log_lost : float
+    log_all_outlier : float
         Log evidence of the hypothesis that all factors are outliers, which is none of the above.
     omitted : int
         Hypotheses that ``most_products`` left out.
@@ -108,11 +108,11 @@ def multiply_factors(
             for n in range(len(left)):
                 beam[row, n] = product[row, left[n]]
         score, pattern, chosen = score[left], next_pattern[left], next_chosen
-    log_lost = 0.0
+    log_all_outlier = 0.0
     for factor in range(len(offsets) - 1):
-        log_lost += alternatives[-1, offsets[factor + 1] - 1]
+        log_all_outlier += alternatives[-1, offsets[factor + 1] - 1]
     log_weight, mean, cov, chosen = _placed(beam, score, chosen)
-    return log_weight, mean, cov, chosen, log_lost, omitted
+    return log_weight, mean, cov, chosen, log_all_outlier, omitted
 
 
 @numba.njit(cache=True, nogil=True)

@@ -27,7 +27,7 @@ from rayfix_service.fusion.measurements.report import (
     TimeOfArrival,
 )
 from rayfix_service.fusion.product.beam_kernels import product_costs
-from rayfix_service.fusion.product.station_mixture import HeardStation
+from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.level import WINDOW_RATIO, Level
 
@@ -114,11 +114,11 @@ class CostEstimate:
 
     Parameters
     ----------
-    stations : mapping of str to HeardStation
+    stations : mapping of str to StationMixtures
     settings : FusionSettings
     """
 
-    def __init__(self, stations: Mapping[str, HeardStation], settings: FusionSettings) -> None:
+    def __init__(self, stations: Mapping[str, StationMixtures], settings: FusionSettings) -> None:
         self._stations = stations
         self._levels = {name: [_level_cost(level) for level in s.part.levels] for name, s in stations.items()}
         self._settings = settings

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from rayfix_service.fusion.measurements.clocks import ClockReading
 from rayfix_service.fusion.measurements.directions import Direction
 from rayfix_service.fusion.measurements.likelihood import Term, product, total_variance
-from rayfix_service.fusion.measurements.line_of_sight import sight
+from rayfix_service.fusion.measurements.line_of_sight import line_of_sight_weights
 from rayfix_service.fusion.measurements.observations import Observation
 from rayfix_service.fusion.product.beam_kernels import product_costs
 from rayfix_service.fusion.product.factor_kernels import ALL_GOOD, PART, READING, TIME_OUTLIER, make_alternatives
 from rayfix_service.fusion.product.prior import Prior
-from rayfix_service.fusion.product.station_mixture import HeardStation, join
+from rayfix_service.fusion.product.station_mixture import StationMixtures, join
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
 
@@ -52,7 +52,7 @@ class Factor:
 
 def make_factor(
     observation: Observation,
-    station: HeardStation,
+    station: StationMixtures,
     *,
     num_clocks: int,
     max_path_length: float,
@@ -80,11 +80,11 @@ def make_factor(
         When it was.
     """
     said = observation.los_probability
-    seen = None if said is None else sight(said, settings.sight_error)
-    heard, bounds = [], [0]
+    seen = None if said is None else line_of_sight_weights(said, settings.sight_error)
+    mixtures, bounds = [], [0]
     for spread in observation.angle_spreads:
-        heard.append(station.towards(_widened(observation.direction, spread.scale), seen))
-        bounds.append(bounds[-1] + len(heard[-1]))
+        mixtures.append(station.towards(_widened(observation.direction, spread.scale), seen))
+        bounds.append(bounds[-1] + len(mixtures[-1]))
     if bounds[-1] == 0:
         return None
     # Noise counts, so that a measurement with very much of it does not look like an outlier.
@@ -109,7 +109,7 @@ def make_factor(
     if num_clocks:
         most = int(most / math.sqrt(product_costs(3 + num_clocks)[0]))
     columns, outlier, omitted = make_alternatives(
-        *join(heard),
+        *join(mixtures),
         np.array(taken, PART),
         np.array(readings, READING),
         num_clocks,

@@ -11,7 +11,7 @@ from rayfix_service.fusion.measurements.observations import Observation
 from rayfix_service.fusion.product.factor_kernels import ALL_OUTLIER, TIME_OUTLIER
 
 
-class Culprits(NamedTuple):
+class OutlierIndex(NamedTuple):
     """What in a hypothesis makes each measurement an outlier.
 
     Attributes
@@ -26,7 +26,7 @@ class Culprits(NamedTuple):
     rows: NDArray[np.int64]
 
 
-def culprits(observations: Sequence[Observation]) -> Culprits:
+def outlier_index(observations: Sequence[Observation]) -> OutlierIndex:
     """Which outliers of the observations make which measurements of the report outliers."""
     # A time difference is as bad as the worse of its two times.
     number: dict[int, int] = {}
@@ -36,7 +36,7 @@ def culprits(observations: Sequence[Observation]) -> Culprits:
             rows.append((number.setdefault(observation.angle_index, len(number)), n, ALL_OUTLIER))
         times = (*observation.timing_indices, *observation.differences)
         rows += [(number.setdefault(index, len(number)), n, TIME_OUTLIER) for index in times]
-    return Culprits(list(number), np.array(rows))
+    return OutlierIndex(list(number), np.array(rows))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -52,7 +52,7 @@ def outlier_probabilities(outlier: Any, weight: Any, lost: Any, rows: Any, count
     lost : float
         Posterior probability that everything is an outlier.
     rows : ndarray of int64, shape (r, 3)
-        As in :class:`Culprits`.
+        As in :class:`OutlierIndex`.
     count : int
         Number of measurements there.
 

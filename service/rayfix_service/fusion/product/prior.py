@@ -38,7 +38,7 @@ class Prior:
     eta: float = 0.0
 
 
-def even_prior(free_space: FreeSpace) -> Prior:
+def uniform_prior(free_space: FreeSpace) -> Prior:
     """Prior of a UE of which nothing is known."""
     return Prior(log_volume=math.log(max(free_space.volume, 1.0)))
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.lookup.lookup import Lookup, look_up
 from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
-from rayfix_service.fusion.measurements.line_of_sight import Sight
+from rayfix_service.fusion.measurements.line_of_sight import LineOfSightWeights
 from rayfix_service.fusion.product.merging import merge_gaussians
 from rayfix_tables.gaussians.conditioning import condition_on_angle
 from rayfix_tables.table import StationPart
@@ -23,7 +23,7 @@ _MAX_DIVERGENCE = 1e-4
 """What merging two of them may cost, nats: a path length picks a small part of them all."""
 
 
-class Heard(NamedTuple):
+class StationMixture(NamedTuple):
     """Weighted Gaussians over (x, path length).
 
     Attributes
@@ -41,70 +41,72 @@ class Heard(NamedTuple):
         """Return the number of Gaussians."""
         return len(self.log_evidence)
 
-    def those(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> "Heard":
+    def those(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> "StationMixture":
         """Gaussians that an index picks."""
-        return Heard(*(array[index] for array in self))
+        return StationMixture(*(array[index] for array in self))
 
-    def weighed(self, log_weight: NDArray[np.float64] | float) -> "Heard":
+    def weighted(self, log_weight: NDArray[np.float64] | float) -> "StationMixture":
         """Give them more weight, by its logarithm."""
-        return Heard(self.log_evidence + log_weight, self.mean, self.cov)
+        return StationMixture(self.log_evidence + log_weight, self.mean, self.cov)
 
-    def merged(self) -> "Heard":
+    def merged(self) -> "StationMixture":
         """Merge in place those that no path length tells apart."""
         return self.those(merge_gaussians(*self, (0.0, 0.0, 0.0, _RANGE_STDEV**2), _MAX_DIVERGENCE))
 
 
-def join(parts: Sequence[Heard]) -> Heard:
+def join(parts: Sequence[StationMixture]) -> StationMixture:
     """Gaussians of all parts."""
-    return parts[0] if len(parts) == 1 else Heard(*map(np.concatenate, zip(*parts, strict=True)))
+    return parts[0] if len(parts) == 1 else StationMixture(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)
-class HeardStation:
+class StationMixtures:
     """A station's part of the table, and what follows from it for reports without an angle."""
 
     part: StationPart
 
-    def towards(self, measured: Direction, sight: Sight | None = None) -> Heard:
+    def towards(self, measured: Direction, weights: LineOfSightWeights | None = None) -> StationMixture:
         """Gaussians of the paths from a measured direction; none where no ray comes.
 
         Parameters
         ----------
-        sight : Sight, optional
+        weights : LineOfSightWeights, optional
             What the weights of direct and of reflected paths are multiplied by.
         """
         anywhere = measured.azimuth is None and measured.zenith is None
-        if sight is None:
+        if weights is None:
             return self.everywhere if anywhere else _condition(look_up(self.part.levels, measured))
         if anywhere:
-            return join([heard.weighed(log) for heard, log in zip(self.everywhere_by_sight, sight, strict=True)])
+            return join(
+                [mixture.weighted(log) for mixture, log in zip(self.everywhere_by_line_of_sight, weights, strict=True)]
+            )
         lookup = look_up(self.part.levels, measured)
-        return _condition(lookup).weighed(np.where(is_direct(lookup), *sight))
+        return _condition(lookup).weighted(np.where(is_direct(lookup), *weights))
 
-    def kept(self, by_sight: bool) -> int | None:
+    def kept(self, by_line_of_sight: bool) -> int | None:
         """Return how many Gaussians the paths of all directions are, None while they are not merged yet."""
-        found = self.__dict__.get("everywhere_by_sight" if by_sight else "everywhere")
+        found = self.__dict__.get("everywhere_by_line_of_sight" if by_line_of_sight else "everywhere")
         if found is None:
             return None
-        return sum(map(len, found)) if by_sight else len(found)
+        return sum(map(len, found)) if by_line_of_sight else len(found)
 
     @cached_property
-    def everywhere(self) -> Heard:
+    def everywhere(self) -> StationMixture:
         """Gaussians of the paths of all directions, those merged that no path length tells apart."""
         return _condition(look_up(self.part.levels, NO_DIRECTION)).merged()
 
     @cached_property
-    def everywhere_by_sight(self) -> tuple[Heard, Heard]:
+    def everywhere_by_line_of_sight(self) -> tuple[StationMixture, StationMixture]:
         """Direct paths and reflected ones of all directions, either merged like :attr:`everywhere`."""
         lookup = look_up(self.part.levels, NO_DIRECTION)
-        heard, direct = _condition(lookup), is_direct(lookup)
-        return heard.those(direct).merged(), heard.those(~direct).merged()
+        mixture, direct = _condition(lookup), is_direct(lookup)
+        return mixture.those(direct).merged(), mixture.those(~direct).merged()
 
 
-def _condition(lookup: Lookup) -> Heard:
+def _condition(lookup: Lookup) -> StationMixture:
     """Condition every component of the cells looked up on the rest of the measured angle."""
     level = lookup.level
-    return Heard(
+    return StationMixture(
         *_condition_cells(
             *level.mixture.tubes,
             level.log_balance,

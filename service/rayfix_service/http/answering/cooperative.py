@@ -13,14 +13,14 @@ _LOOK_SECONDS = 0.02
 _log = logging.getLogger(__name__)
 
 
-class Patience:
+class Cooperation:
     """Lets other requests in between the parts of one, and looks whether its client is still there."""
 
     def __init__(self, request: Request) -> None:
         self._request = request
         self._looked = monotonic()
 
-    async def take_a_breath(self) -> None:
+    async def let_others_run(self) -> None:
         """Let others in; to be awaited before each part.
 
         Raises

@@ -18,9 +18,9 @@ from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.stopping import NEVER
 from rayfix_service.http.answering.feed import FixFeed
-from rayfix_service.http.answering.response_options import Wanted
+from rayfix_service.http.answering.response_options import ResponseOptions
 from rayfix_service.http.answering.served_tables import ServedTable
-from rayfix_service.http.answering.slow_work import SlowFixes, Stoppable
+from rayfix_service.http.answering.slow_work import SlowWork, Stoppable
 from rayfix_service.http.problems import ProblemError, internal_problem, problem_document, report_problem
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.telemetry.metrics import Metrics
@@ -95,7 +95,7 @@ class Answerer:
         To add to.
     feed : FixFeed
         To tell of fixes.
-    slow_fixes : SlowFixes
+    slow_work : SlowWork
         Threads for what takes longer, by its estimate, than ``quick_seconds``.
     hub : OmloxHub or None
         To tell of positions.
@@ -107,7 +107,7 @@ class Answerer:
 
     metrics: Metrics
     feed: FixFeed
-    slow_fixes: SlowFixes
+    slow_work: SlowWork
     hub: OmloxHub | None
     quick_seconds: float = ServiceSettings.quick_fix_seconds
     reading: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -125,7 +125,7 @@ class Answerer:
         async with self.reading:
             return await asyncio.to_thread(parse, body)
 
-    async def answer(self, table: ServedTable, incoming: Incoming, wanted: Wanted) -> dict[str, Any]:
+    async def answer(self, table: ServedTable, incoming: Incoming, options: ResponseOptions) -> dict[str, Any]:
         """Locate a report with a table and write the answer as wanted.
 
         Raises
@@ -133,9 +133,9 @@ class Answerer:
         ReportError, ProblemError
             As :meth:`locate` and :meth:`write` do.
         """
-        return self.write(table, incoming, wanted, await self.locate(table, incoming, wanted))
+        return self.write(table, incoming, options, await self.locate(table, incoming, options))
 
-    async def locate(self, table: ServedTable, incoming: Incoming, wanted: Wanted) -> Located:
+    async def locate(self, table: ServedTable, incoming: Incoming, options: ResponseOptions) -> Located:
         """Locate a report with a table, and follow its target if that is wanted.
 
         A fix that takes less than a millisecond or a few by its estimate, as most do, is made right on the event loop.
@@ -151,12 +151,12 @@ class Answerer:
         """
         report = incoming.report
         locator = table.locator
-        locate = cast("Stoppable[Report, Fix | Fused]", locator.fuse if wanted.follows(report) else locator.locate)
+        locate = cast("Stoppable[Report, Fix | Fused]", locator.fuse if options.follows(report) else locator.locate)
         quick = table.locator.seconds(report) <= self.quick_seconds
         start = perf_counter()
         try:
             found: Fix | Fused
-            found = locate(report, stop=NEVER) if quick else await self.slow_fixes.locate(locate, report)
+            found = locate(report, stop=NEVER) if quick else await self.slow_work.locate(locate, report)
             seconds = perf_counter() - start
             fix = found.fix if isinstance(found, Fused) else found
             self.metrics.fix_done(fix, seconds)
@@ -169,7 +169,9 @@ class Answerer:
             self.metrics.track_done(track.state)
         return Located(fix, track, seconds)
 
-    def write(self, table: ServedTable, incoming: Incoming, wanted: Wanted, located: Located) -> dict[str, Any]:
+    def write(
+        self, table: ServedTable, incoming: Incoming, options: ResponseOptions, located: Located
+    ) -> dict[str, Any]:
         """Tell who listens of a fix, and write the answer as wanted.
 
         Raises
@@ -182,15 +184,15 @@ class Answerer:
         site = table.site
         if self.hub is not None:
             self.hub.tell(fix, site, track)
-        return write(fix, wanted.output, site, compute_seconds=seconds, adapted=incoming.adapted, track=track)
+        return write(fix, options.output, site, compute_seconds=seconds, adapted=incoming.adapted, track=track)
 
     async def answer_or_problem(
-        self, table: ServedTable, make: Callable[[], Incoming | Awaitable[Incoming]], wanted: Wanted
+        self, table: ServedTable, make: Callable[[], Incoming | Awaitable[Incoming]], options: ResponseOptions
     ) -> dict[str, Any]:
         """Answer one report of several, with a problem where it cannot be used."""
         try:
             made = make()
-            return await self.answer(table, made if isinstance(made, Incoming) else await made, wanted)
+            return await self.answer(table, made if isinstance(made, Incoming) else await made, options)
         except Exception as error:
             return problem_of(error)
 

@@ -21,7 +21,7 @@ MEDIA_TYPES: dict[str, OutputFormat] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wanted:
+class ResponseOptions:
     """What a request wants.
 
     Attributes
@@ -45,9 +45,9 @@ class Wanted:
         return self.track and (self.must_track or None not in (report.target_id, report.timestamp))
 
 
-def wanted_by(
+def response_options_of(
     scope: Scope, settings: ServiceSettings, output: OutputFormat | None = None, track: bool | None = None
-) -> Wanted:
+) -> ResponseOptions:
     """Return what a request wants by its query, else by its Accept header and the service's settings."""
     media_type = JSON
     if output is None:
@@ -56,8 +56,8 @@ def wanted_by(
 
 
 @cache
-def _wanted(output: OutputFormat, media_type: str, track: bool, must_track: bool) -> Wanted:
-    return Wanted(output=output, media_type=media_type, track=track, must_track=must_track)
+def _wanted(output: OutputFormat, media_type: str, track: bool, must_track: bool) -> ResponseOptions:
+    return ResponseOptions(output=output, media_type=media_type, track=track, must_track=must_track)
 
 
 def _accepted(accept: str | None) -> tuple[str, OutputFormat]:

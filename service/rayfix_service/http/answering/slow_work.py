@@ -21,7 +21,7 @@ class Stoppable(Protocol[Asked_contra, T_co]):
         """Do it."""
 
 
-class SlowFixes:
+class SlowWork:
     """Threads for slow fixes.
 
     Parameters

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 
-class PerTable:
+class TableCache:
     """Keeps what is computed of tables, the latest ones, by ``table_id`` and a name.
 
     Parameters

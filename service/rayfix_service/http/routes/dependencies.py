@@ -13,7 +13,7 @@ from starlette.types import Receive, Scope
 
 from rayfix_service.adapters.formats import OutputFormat
 from rayfix_service.http.answering.locating import Answerer
-from rayfix_service.http.answering.response_options import MEDIA_TYPES, Wanted, wanted_by
+from rayfix_service.http.answering.response_options import MEDIA_TYPES, ResponseOptions, response_options_of
 from rayfix_service.http.answering.served_tables import ServedTable, Tables
 from rayfix_service.http.headers import header
 from rayfix_service.http.problems import (
@@ -76,14 +76,14 @@ Track = Annotated[
 ]
 
 
-async def get_wanted(
+async def get_response_options(
     connection: HTTPConnection, services: ServicesDep, output: Output = None, track: Track = None
-) -> Wanted:
+) -> ResponseOptions:
     """Read what a request wants."""
-    return wanted_by(connection.scope, services.settings, output, track)
+    return response_options_of(connection.scope, services.settings, output, track)
 
 
-WantedDep = Annotated[Wanted, Depends(get_wanted)]
+ResponseOptionsDep = Annotated[ResponseOptions, Depends(get_response_options)]
 
 
 def body_reader(limit_of: Callable[[BodyLimits], int], *, text: bool = False) -> Callable[[Request], Awaitable[bytes]]:

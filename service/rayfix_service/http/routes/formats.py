@@ -12,7 +12,7 @@ from rayfix_service.adapters.nrppa_documents import NrppaDocument
 from rayfix_service.adapters.silabs import SilabsDocument, parse_silabs
 from rayfix_service.adapters.ublox import parse_ublox
 from rayfix_service.http.access.guard import charge_reports
-from rayfix_service.http.answering.cooperative import Patience
+from rayfix_service.http.answering.cooperative import Cooperation
 from rayfix_service.http.answering.locating import foreign
 from rayfix_service.http.openapi.examples import NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.http.openapi.responses import (
@@ -22,7 +22,7 @@ from rayfix_service.http.openapi.responses import (
     request_body,
 )
 from rayfix_service.http.problems import MALFORMED_JSON, Problem
-from rayfix_service.http.routes.dependencies import AnswererDep, LinesBody, ReportBody, TableDep, WantedDep
+from rayfix_service.http.routes.dependencies import AnswererDep, LinesBody, ReportBody, ResponseOptionsDep, TableDep
 from rayfix_service.http.routes.json_answer import JsonAnswer
 
 router = APIRouter(prefix="/v1/positions", tags=["formats"])
@@ -43,10 +43,12 @@ class LinesResult(BaseModel):
     responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(NrppaDocument, NRPPA_EXAMPLES),
 )
-async def post_nrppa(answerer: AnswererDep, table: TableDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
+async def post_nrppa(
+    answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
+) -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
     incoming = foreign(await answerer.read(parse_nrppa, body))
-    return JsonAnswer(await answerer.answer(table, incoming, wanted), media_type=wanted.media_type)
+    return JsonAnswer(await answerer.answer(table, incoming, options), media_type=options.media_type)
 
 
 @router.post(
@@ -56,10 +58,12 @@ async def post_nrppa(answerer: AnswererDep, table: TableDep, body: ReportBody, w
     responses={**ADAPTED_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(SilabsDocument, SILABS_EXAMPLES),
 )
-async def post_silabs(answerer: AnswererDep, table: TableDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
+async def post_silabs(
+    answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
+) -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
     incoming = foreign(await answerer.read(parse_silabs, body))
-    return JsonAnswer(await answerer.answer(table, incoming, wanted), media_type=wanted.media_type)
+    return JsonAnswer(await answerer.answer(table, incoming, options), media_type=options.media_type)
 
 
 @router.post(
@@ -79,7 +83,7 @@ async def post_ublox(
     answerer: AnswererDep,
     table: TableDep,
     body: LinesBody,
-    wanted: WantedDep,
+    options: ResponseOptionsDep,
     station: Annotated[list[str], Query(description="ANCHOR=STATION, for anchors whose id is no station's")] = [],  # noqa: B006
     height_m: Annotated[float | None, Query(description="known height of the tags, z in the scene frame, m")] = None,
     height_stdev_m: Annotated[float | None, Query(description="its standard deviation, m")] = None,
@@ -88,8 +92,8 @@ async def post_ublox(
     known, results = known_height(height_m, height_stdev_m), []
     messages = await answerer.read(partial(parse_ublox, stations=station_map(station)), body)
     charge_reports(request, len(messages))
-    patience = Patience(request)
+    cooperation = Cooperation(request)
     for adapted in messages:
-        await patience.take_a_breath()
-        results.append(await answerer.answer_or_problem(table, partial(foreign, with_height(adapted, known)), wanted))
+        await cooperation.let_others_run()
+        results.append(await answerer.answer_or_problem(table, partial(foreign, with_height(adapted, known)), options))
     return JsonAnswer({"results": results})

@@ -10,13 +10,20 @@ from starlette.datastructures import State
 from starlette.types import Receive, Scope
 
 from rayfix_service.http.access.guard import charge_reports
-from rayfix_service.http.answering.cooperative import Patience
+from rayfix_service.http.answering.cooperative import Cooperation
 from rayfix_service.http.answering.locating import Incoming, native, problem_of
-from rayfix_service.http.answering.response_options import wanted_by
+from rayfix_service.http.answering.response_options import response_options_of
 from rayfix_service.http.openapi.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
 from rayfix_service.http.openapi.responses import NATIVE_ANSWER, POSITION_PROBLEMS, NativeOrOther, request_body
 from rayfix_service.http.problems import Problem
-from rayfix_service.http.routes.dependencies import AnswererDep, BatchBody, ReportBody, TableDep, WantedDep, read_body
+from rayfix_service.http.routes.dependencies import (
+    AnswererDep,
+    BatchBody,
+    ReportBody,
+    ResponseOptionsDep,
+    TableDep,
+    read_body,
+)
 from rayfix_service.http.routes.json_answer import JsonAnswer, write_json
 from rayfix_service.http.services import services_in
 from rayfix_service.wire import BatchDocument, MalformedJsonError, ReportDocument
@@ -45,10 +52,12 @@ router = APIRouter(prefix="/v1", tags=["positions"])
     responses={**NATIVE_ANSWER, **POSITION_PROBLEMS},
     openapi_extra=request_body(ReportDocument, REPORT_EXAMPLES),
 )
-async def post_position(answerer: AnswererDep, table: TableDep, body: ReportBody, wanted: WantedDep) -> JsonAnswer:
+async def post_position(
+    answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
+) -> JsonAnswer:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
     return JsonAnswer(
-        await answerer.answer(table, await answerer.read(native, body), wanted), media_type=wanted.media_type
+        await answerer.answer(table, await answerer.read(native, body), options), media_type=options.media_type
     )
 
 
@@ -62,12 +71,12 @@ async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple
     answerer = services.answerer
     table = services.tables.named(None)
     body = await read_body(scope, receive, services.settings.body_limits.report)
-    wanted = wanted_by(scope, services.settings)
+    options = response_options_of(scope, services.settings)
     incoming = await answerer.read(native, body)
     await asyncio.sleep(0)
-    located = await answerer.locate(table, incoming, wanted)
+    located = await answerer.locate(table, incoming, options)
     await asyncio.sleep(0)
-    return write_json(answerer.write(table, incoming, wanted, located)), wanted.media_type
+    return write_json(answerer.write(table, incoming, options, located)), options.media_type
 
 
 @router.post(
@@ -78,16 +87,16 @@ async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple
     openapi_extra=request_body(BatchDocument, BATCH_EXAMPLES),
 )
 async def post_batch(
-    request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, wanted: WantedDep
+    request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
     texts = await answerer.read(split_batch, body)
     charge_reports(request, len(texts))
-    patience = Patience(request)
+    cooperation = Cooperation(request)
     reports: list[Incoming | dict[str, Any]] = []  # all, before the first is located: a batch is JSON or it is not
     listed = 0
     for number, text in enumerate(texts):
-        await patience.take_a_breath()
+        await cooperation.let_others_run()
         read = partial(native, most_problems=MAX_PROBLEMS if listed < MAX_PROBLEMS else 1)
         try:
             reports.append(await answerer.read(read, text))
@@ -100,8 +109,8 @@ async def post_batch(
     results: list[dict[str, Any]] = []
     for report in reports:  # not by locate_batch: other batches keep the other workers, one for each core, as busy
         if isinstance(report, Incoming):
-            await patience.take_a_breath()
-            results.append(await answerer.answer_or_problem(table, partial(_itself, report), wanted))
+            await cooperation.let_others_run()
+            results.append(await answerer.answer_or_problem(table, partial(_itself, report), options))
         else:
             results.append(report)
     return JsonAnswer({"results": results})

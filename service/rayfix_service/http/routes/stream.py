@@ -16,7 +16,7 @@ from starlette.websockets import WebSocketDisconnect, WebSocketDisconnected
 from rayfix_service.http.access.guard import client_of, limit_of, until_revoked
 from rayfix_service.http.answering.feed import FixEvent
 from rayfix_service.http.answering.locating import native
-from rayfix_service.http.answering.response_options import Wanted
+from rayfix_service.http.answering.response_options import ResponseOptions
 from rayfix_service.http.openapi.examples import FIX_EVENT_EXAMPLE
 from rayfix_service.http.problems import (
     BODY_TOO_LARGE,
@@ -28,7 +28,7 @@ from rayfix_service.http.problems import (
     problem_document,
     problem_responses,
 )
-from rayfix_service.http.routes.dependencies import ServicesDep, TableDep, WantedDep
+from rayfix_service.http.routes.dependencies import ResponseOptionsDep, ServicesDep, TableDep
 from rayfix_service.http.services import Services
 from rayfix_service.wire import FixDocument, ReportDocument
 
@@ -150,7 +150,7 @@ async def stream(
     websocket: WebSocket,
     services: ServicesDep,
     table: Annotated[str | None, Depends(get_table_name)],
-    wanted: WantedDep,
+    options: ResponseOptionsDep,
 ) -> None:
     """Answer each message, a report, with a fix or a problem, in their order.
 
@@ -180,7 +180,7 @@ async def stream(
                         BODY_TOO_LARGE, f"the message is longer than {limit} bytes; send fewer measurements at once"
                     )
                 else:
-                    answer = await _answer(services, table, body, wanted)
+                    answer = await _answer(services, table, body, options)
                 await websocket.send_text(to_json(answer, inf_nan_mode="null").decode())
                 await asyncio.sleep(0)  # whatever else is on the loop comes in between
         except (WebSocketDisconnect, WebSocketDisconnected):
@@ -193,14 +193,14 @@ async def _close(websocket: WebSocket) -> None:
         await websocket.close(_REVOKED, "the API key is no longer taken")
 
 
-async def _answer(services: Services, table: str | None, body: bytes, wanted: Wanted) -> dict[str, Any]:
+async def _answer(services: Services, table: str | None, body: bytes, options: ResponseOptions) -> dict[str, Any]:
     """Answer a message from the table that is served now."""
     try:
         served = services.tables.named(table)
     except ProblemError as error:
         return problem_document(error.kind, str(error), error.errors)
     answerer = services.answerer
-    return await answerer.answer_or_problem(served, partial(answerer.read, native, body), wanted)
+    return await answerer.answer_or_problem(served, partial(answerer.read, native, body), options)
 
 
 async def _next_message(websocket: WebSocket) -> bytes:

@@ -9,10 +9,10 @@ import pytest
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.lookup.lookup import look_up
 from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
-from rayfix_service.fusion.measurements.line_of_sight import Sight
+from rayfix_service.fusion.measurements.line_of_sight import LineOfSightWeights
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, Report
 from rayfix_service.fusion.posterior.fix import Fix
-from rayfix_service.fusion.product.station_mixture import HeardStation, is_direct
+from rayfix_service.fusion.product.station_mixture import StationMixtures, is_direct
 from rayfix_tables.table import Table
 from tests.support.hand_reports import EXACT, angle_of
 from tests.support.hand_tables import POSITIONS, UE, MakeTable, Tube, line_of_sight
@@ -119,17 +119,19 @@ def hall_table(hall_table_path: Path) -> Table:
 @pytest.mark.parametrize("name", DIRECTIONS)
 def test_direct_and_reflected_paths_make_all_paths(hall_table: Table, name: str) -> None:
     """In a table with many components a cell: weighed by (a, b), the evidence is a of the one and b of the other."""
-    station, measured = HeardStation(hall_table.parts["bs1"]), DIRECTIONS[name]
+    station, measured = StationMixtures(hall_table.parts["bs1"]), DIRECTIONS[name]
 
-    def evidence(sight: Sight | None) -> float:
-        return float(np.exp(station.towards(measured, sight).log_evidence).sum())
+    def evidence(line_of_sight_weights: LineOfSightWeights | None) -> float:
+        return float(np.exp(station.towards(measured, line_of_sight_weights).log_evidence).sum())
 
-    whole, direct = evidence(None), evidence(Sight(0.0, -np.inf))
-    reflected = evidence(Sight(-np.inf, 0.0))
+    whole, direct = evidence(None), evidence(LineOfSightWeights(0.0, -np.inf))
+    reflected = evidence(LineOfSightWeights(-np.inf, 0.0))
     assert direct > 0.05 * whole
     assert reflected > 0.05 * whole
     assert direct + reflected == pytest.approx(whole, rel=1e-9)
-    assert evidence(Sight(np.log(1.8), np.log(0.2))) == pytest.approx(1.8 * direct + 0.2 * reflected, rel=1e-9)
+    assert evidence(LineOfSightWeights(np.log(1.8), np.log(0.2))) == pytest.approx(
+        1.8 * direct + 0.2 * reflected, rel=1e-9
+    )
 
 
 def test_components_are_told_by_the_reflections_of_the_table(hall_table: Table, make_table: MakeTable) -> None:

@@ -16,7 +16,7 @@ from rayfix_service.fusion.posterior.points import DrawnPoints, draw_points
 from rayfix_service.fusion.posterior.posterior import make_posterior
 from rayfix_service.fusion.posterior.principal_axes import semi_axes
 from rayfix_service.fusion.product.beam import Hypotheses
-from rayfix_service.fusion.product.prior import even_prior
+from rayfix_service.fusion.product.prior import uniform_prior
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.normal_points import normal_points
 from tests.support import kernel_twins
@@ -173,9 +173,13 @@ def test_regions_hold_their_share_of_the_posterior(probability: float) -> None:
     # Of forty cut Gaussians each has so few points that they are as good as drawn.
     for (log_weight, mean, cov), space, tolerance in ((two_hills(), OPEN, 0.02), (many, solid, 0.035)):
         hypotheses = Hypotheses(
-            log_weight=log_weight, mean=mean, cov=cov, outlier=np.zeros((len(mean), 1), np.int8), log_lost=-np.inf
+            log_weight=log_weight,
+            mean=mean,
+            cov=cov,
+            outlier=np.zeros((len(mean), 1), np.int8),
+            log_all_outlier=-np.inf,
         )
-        drawn = make_posterior(hypotheses, even_prior(space), space).sample(20_000, rng)
+        drawn = make_posterior(hypotheses, uniform_prior(space), space).sample(20_000, rng)
         regions = regions_of(log_weight, mean, cov, space)
         assert held(regions.ellipsoid(probability), drawn) == pytest.approx(probability, abs=tolerance)
         assert held(regions.upright_ellipsoid(probability), drawn) == pytest.approx(probability, abs=tolerance)

@@ -12,7 +12,7 @@ from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Angle, Height, Report, TimeOfArrival
 from rayfix_service.fusion.posterior.posterior import Posterior, free_shares, make_posterior
 from rayfix_service.fusion.product.beam import Hypotheses
-from rayfix_service.fusion.product.prior import Prior, even_prior, height_prior
+from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_prior
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Table
 from tests.support import kernel_twins
@@ -36,11 +36,11 @@ def hypotheses(seed: int, count: int = 12, lost: float = 0.1) -> Hypotheses:
         mean=rng.uniform([-1.0, 2.0, 0.5], [3.0, 6.0, 2.5], (count, 3)),
         cov=0.06 * root @ root.transpose(0, 2, 1) + 0.01 * np.eye(3),
         outlier=np.zeros((count, 1), np.int8),
-        log_lost=math.log(lost) - 7.0,
+        log_all_outlier=math.log(lost) - 7.0,
     )
 
 
-PRIORS = {"even": even_prior(SPACE), "height": height_prior(Height(z=1.3, stdev=0.3), SPACE)}
+PRIORS = {"even": uniform_prior(SPACE), "height": height_prior(Height(z=1.3, stdev=0.3), SPACE)}
 
 
 def grid(step: int) -> tuple[Array, float]:
@@ -78,7 +78,7 @@ def test_the_density_is_that_of_the_twin_in_the_free_space_and_none_elsewhere(pr
     if prior == "height":
         whole = float(np.exp(-0.5 * ((places[:, 2] - height.z) / height.stdev) ** 2).sum()) * volume
     joint = np.exp(kernel_twins.mixture_log_density(points[free], given.log_weight, given.mean, given.cov))
-    joint += np.exp(given.log_lost) * flat / whole
+    joint += np.exp(given.log_all_outlier) * flat / whole
     found = posterior.log_density(points)
     np.testing.assert_allclose(found[free] + posterior.log_evidence, np.log(joint), rtol=0, atol=2e-3)
     assert (found[~free] == -np.inf).all()

@@ -13,7 +13,7 @@ import pytest
 
 from rayfix.client.models import fix_answer
 from rayfix_service.adapters.omlox_hub import HubSettings
-from rayfix_service.http.answering.response_options import wanted_by
+from rayfix_service.http.answering.response_options import response_options_of
 from rayfix_service.http.openapi.examples import SILABS_EXAMPLES
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.server.app import create_app
@@ -133,7 +133,7 @@ def test_the_accept_header_chooses_the_format(hall_table_path: Path):
 )
 def test_accept_headers(accept: str | None, output: str, media_type: str | None):
     headers = [] if accept is None else [(b"accept", accept.encode())]
-    wanted = wanted_by({"type": "http", "headers": headers}, SETTINGS)
+    wanted = response_options_of({"type": "http", "headers": headers}, SETTINGS)
     assert wanted.output == output
     assert wanted.media_type == (media_type or f"application/vnd.rayfix.{output}+json")
     assert not wanted.track
