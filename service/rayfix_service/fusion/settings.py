@@ -52,7 +52,7 @@ class FusionSettings:
 
     outlier_probability: Probability = 0.01
     sight_error: Annotated[float, Limits(above=0.0, most=0.5)] = 0.05
-    beam_width: Annotated[int, Limits(least=1)] = 2048
+    beam_width: Annotated[int, Limits(least=1, most=1_000_000)] = 2048
     most_alternatives: Annotated[int, Limits(least=1)] = 8192
     most_considered: Annotated[int, Limits(least=1)] = 2**23
     considered_tables: Annotated[int, Limits(least=1)] = 64

@@ -31,7 +31,7 @@ def assert_equal(fix: Fix, expected: Posterior) -> None:
     assert len(fix.candidates) == 1
     assert fix.candidates[0].probability == pytest.approx(1.0 - expected.lost, abs=1e-6)
     np.testing.assert_allclose(fix.candidates[0].position, expected.mean, rtol=0, atol=1e-6)  # m
-    # m2, about 1e-2: of the oracle's hypotheses the far ones, of a probability of 1e-6, are a hill of their own.
+    # m2, about 1e-2: of the oracle's hypotheses the far ones, of a probability of 1e-6, are a mode of their own.
     np.testing.assert_allclose(fix.candidates[0].covariance, expected.cov, rtol=0, atol=5e-6)
     assert [outcome.outlier_probability for outcome in fix.outcomes] == pytest.approx(expected.outlier, abs=1e-6)
 

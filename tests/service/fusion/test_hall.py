@@ -189,7 +189,7 @@ def test_the_beam_finds_what_the_exhaustive_product_finds(hall: Hall, timing: Ti
 def test_a_wider_beam_without_merging_gives_the_same_fix(hall: Hall, timing: Timing) -> None:
     """And the whole posterior is nearly the same: its divergence (Kullback-Leibler), by samples.
 
-    A shoulder of a hill may just be a hill by itself or just be none; mostly the hills are the same.
+    A shoulder of a mode may just be a mode by itself or just be none; mostly the modes are the same.
     """
     wide = Locator(hall.table, FusionSettings(beam_width=8192, max_divergence=0.0))
     same_hills = 0

@@ -271,6 +271,27 @@ def test_extend_beam_gives_up_hopeless_products() -> None:
     np.testing.assert_allclose(score, expected[hopeful], rtol=0, atol=1e-7)  # nats
 
 
+def test_numbers_of_outlier_patterns_tell_histories_apart_however_many_factors() -> None:
+    """Numbers of 256 factors to the base 3 would need 406 bits; half of the histories differ in the first only."""
+    rng = np.random.default_rng(4)
+    num_hypotheses = 60
+    histories: list[tuple[int, ...]] = [()] * num_hypotheses
+    pattern = np.zeros(num_hypotheses, np.int64)
+    for place in range(256):
+        outlier = rng.integers(0, 3, num_hypotheses).astype(np.int8)
+        half = num_hypotheses // 2
+        outlier[half:] = (outlier[:half] + 1) % 3 if place == 0 else outlier[:half]
+        histories = [(*history, int(state)) for history, state in zip(histories, outlier, strict=True)]
+        pattern = beam_kernels.extend_patterns(pattern, outlier, place)
+        assert pattern.min() >= 0
+        same = np.array([[a == b for b in histories] for a in histories])
+        np.testing.assert_array_equal(pattern[:, None] == pattern[None, :], same)
+        # The best hypotheses of the next step may come from any of these.
+        parent = rng.integers(0, num_hypotheses, num_hypotheses)
+        parent[half:] = (parent[:half] + half) % num_hypotheses
+        pattern, histories = pattern[parent], [histories[n] for n in parent]
+
+
 def test_cutting_to_the_free_space_equals_its_twin() -> None:
     rng = np.random.default_rng(6)
     free_space = FreeSpace(origin=np.array([-1.0, 2.0, 0.5]), voxel_size=0.25, free=rng.random((10, 8, 6)) < 0.6)

@@ -1,6 +1,6 @@
 """Credible regions: ellipsoids, circles and layers around a position that hold the UE with a stated probability.
 
-The posterior has several hills and is cut to the free space, so no covariance tells how far a region must reach. Points
+The posterior has several modes and is cut to the free space, so no covariance tells how far a region must reach. Points
 drawn evenly from the whole posterior do: the region of probability p is as large as it takes to hold a share p of them.
 Where the best candidate is less probable than p, the region reaches to its rivals.
 """

@@ -27,7 +27,7 @@ class Candidate:
     probability : float
         Posterior probability that the UE is there.
     position : ndarray of shape (3,), m
-        Mean of the posterior over one of its hills.
+        Mean of the posterior over one of its modes.
     covariance : ndarray of shape (3, 3), m2
         Second moment of the posterior about ``position``.
     """

@@ -1,4 +1,4 @@
-"""From a mixture of hypotheses to candidates: the hills of the posterior, and which hypotheses belong to which.
+"""From a mixture of hypotheses to candidates: the modes of the posterior, and which hypotheses belong to which.
 
 The NumPy twins of some kernels are in ``reference.py``.
 """
@@ -11,13 +11,13 @@ import numpy as np
 from rayfix_service.fusion.posterior.cholesky import cholesky, invert, solve
 from rayfix_service.fusion.posterior.voxels import is_free_place, nearest_free
 
-_SAME_HILL = 9.0
-"""Two modes nearer than this, squared and in what either is uncertain by, are two humps of one hill."""
+_SAME_MODE = 9.0
+"""Two maxima nearer than this, squared and in what either is uncertain by, count as one mode."""
 
 
 @numba.njit(cache=True, nogil=True)
 def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: Any, free: Any, stop: Any) -> Any:
-    """Climb from Gaussians to the modes of their mixture, gather them by the hill they belong to, sum each hill up.
+    """Climb from Gaussians to the modes of their mixture, group them by mode, and sum each group up.
 
     Parameters
     ----------
@@ -33,13 +33,13 @@ def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
     Returns
     -------
     probability : ndarray of shape (m,)
-        Of each hill, the most probable first.
+        Of each mode, the most probable first.
     position : ndarray of shape (m, 3), m
-        Mean of the hill's Gaussians; the hill's mode, or the nearest free place, where the mean is in a solid.
+        Mean of the mode's Gaussians; the mode itself, or the nearest free place, where the mean is in a solid.
     moment : ndarray of shape (m, 3, 3), m2
-        Second moment of the hill's Gaussians about ``position``.
+        Second moment of the mode's Gaussians about ``position``.
     member : ndarray of int64, shape (h,)
-        Hill of each Gaussian.
+        Mode of each Gaussian.
     """
     count = len(log_weight)
     log_density = np.empty(count)
@@ -48,7 +48,7 @@ def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
         cholesky(cov[h], lower)
         invert(lower, precision[h])
         log_density[h] = log_weight[h] - np.log(lower[0, 0] * lower[1, 1] * lower[2, 2])
-    top, member = gather(log_density, mean, precision, _SAME_HILL, stop)
+    top, member = gather(log_density, mean, precision, _SAME_MODE, stop)
     weight = np.exp(log_weight)
     probability, position = np.zeros(len(top)), np.zeros((len(top), 3))
     for h in range(count):
@@ -75,7 +75,7 @@ def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
 
 @numba.njit(cache=True, nogil=True)
 def _second_moments(weight: Any, mean: Any, cov: Any, member: Any, total: Any, position: Any) -> Any:
-    """Second moment of each hill, shape (m, 3, 3), about its position."""
+    """Second moment of each mode, shape (m, 3, 3), about its position."""
     moment = np.zeros((len(total), 3, 3))
     for h in range(len(weight)):
         n = member[h]
@@ -89,7 +89,7 @@ def _second_moments(weight: Any, mean: Any, cov: Any, member: Any, total: Any, p
 
 @numba.njit(cache=True, nogil=True)
 def gather(log_density: Any, mean: Any, precision: Any, same_mode: Any, stop: Any) -> Any:
-    """Climb from each hypothesis, the densest first, and gather the hypotheses by the hill they come to.
+    """Climb from each hypothesis, the densest first, and group the hypotheses by the mode they come to.
 
     Parameters
     ----------
@@ -98,17 +98,17 @@ def gather(log_density: Any, mean: Any, precision: Any, same_mode: Any, stop: An
     mean : ndarray of shape (h, 3), m
     precision : ndarray of shape (h, 3, 3), 1 / m2
     same_mode : float
-        Two modes are one hill, though with two humps, when their squared distance is below this in what either is
+        Two maxima are one mode when their squared distance is below this in what either is
         uncertain by.
     stop : ndarray of uint8, shape (1,)
-        As in :class:`~rayfix_service.fusion.stopping.Stop`; once it is set, those that are left go to the first hill.
+        As in :class:`~rayfix_service.fusion.stopping.Stop`; once it is set, those that are left go to the first mode.
 
     Returns
     -------
     top : ndarray of shape (m, 3), m
-        Mode of each hill, in the order in which they were found.
+        Maximum of each mode, in the order in which they were found.
     member : ndarray of int64, shape (h,)
-        Hill of each hypothesis.
+        Mode of each hypothesis.
     """
     count = len(log_density)
     member = np.zeros(count, np.int64)
@@ -118,18 +118,18 @@ def gather(log_density: Any, mean: Any, precision: Any, same_mode: Any, stop: An
     for h in np.argsort(-log_density):
         if stop[0] != 0 and found > 0:
             break
-        mode, here, mode = climb(log_density, mean, precision, mean[h], top[:found], curvature[:found])
+        mode, here, known = climb(log_density, mean, precision, mean[h], top[:found], curvature[:found])
         for n in range(found):
-            if mode >= 0:
+            if known >= 0:
                 break
             if min(_square(mode, top[n], curvature[n]), _square(mode, top[n], here)) < same_mode:
-                mode = n
-        if mode < 0:
-            mode = found
+                known = n
+        if known < 0:
+            known = found
             top[found] = mode
             curvature[found] = here
             found += 1
-        member[h] = mode
+        member[h] = known
     return top[:found].copy(), member
 
 

@@ -31,10 +31,10 @@ class Summary(NamedTuple):
     lost : float
         Posterior probability that all of it is outliers.
     probability : ndarray of shape (m,)
-        Of the posterior's hills, the most probable first, were not all of it outliers.
+        Of the posterior's modes, the most probable first, were not all of it outliers.
     position : ndarray of shape (m, 3), m
     moment : ndarray of shape (m, 3, 3), m2
-        Second moment of each hill about its position.
+        Second moment of each mode about its position.
     outlier : ndarray of shape (count,)
         Posterior probability of each of the culprits' measurements to be an outlier.
     half_bad : float
@@ -62,7 +62,7 @@ def sum_up(
     hypotheses : Hypotheses
         At least one.
     floor : float
-        Hypotheses whose share of the posterior is below this are left out of the hills.
+        Hypotheses whose share of the posterior is below this are left out of the modes.
     stop : Stop
         Ends it early.
 

@@ -15,6 +15,9 @@ from rayfix_service.fusion.product.merging import merge_hypotheses
 HOPELESS = 20.0
 """A product this many nats below the best is given up: more than one station to come would have to be an outlier."""
 
+_RANKED_AFTER = 26
+"""Factors after which numbers of outlier patterns are ranked: 3**26 times a million hypotheses is below 2**63."""
+
 
 @numba.njit(cache=True, nogil=True)
 def multiply_factors(
@@ -91,9 +94,7 @@ def multiply_factors(
             omitted += 1  # at least
         left_over -= product_cost * beam.shape[1] * (end - begin) + merge_cost * len(score)
         product = np.empty((len(beam), len(score)))
-        next_pattern = np.empty(len(score), np.int64)
-        for n in range(len(score)):
-            next_pattern[n] = 3 * pattern[parent[n]] + outlier[begin + choice[n]]
+        next_pattern = extend_patterns(pattern[parent], outlier[begin + choice], place)
         for row in range(len(beam)):
             for n in range(len(score)):
                 product[row, n] = beam[row, parent[n]] + own[row, choice[n]]
@@ -113,6 +114,34 @@ def multiply_factors(
         log_all_outlier += alternatives[-1, offsets[factor + 1] - 1]
     log_weight, mean, cov, chosen = _placed(beam, score, chosen)
     return log_weight, mean, cov, chosen, log_all_outlier, omitted
+
+
+@numba.njit(cache=True, nogil=True)
+def extend_patterns(pattern: Any, outlier: Any, place: Any) -> Any:
+    """Give numbers to what hypotheses take for outliers, one factor more included; equal numbers mean equal patterns.
+
+    A number has a digit to the base 3 for each factor. Every so many factors the numbers are replaced by their ranks,
+    before they exceed 63 bits.
+
+    Parameters
+    ----------
+    pattern : ndarray of int64, shape (h,)
+        Numbers without the factor.
+    outlier : ndarray of int8, shape (h,)
+        What each hypothesis takes for an outlier in the factor: 0, 1 or 2.
+    place : int
+        Number of factors before this one.
+    """
+    extended = 3 * pattern + outlier
+    if place % _RANKED_AFTER != _RANKED_AFTER - 1:
+        return extended
+    ranked = np.empty_like(extended)
+    rank, order = -1, np.argsort(extended)
+    for n in range(len(order)):
+        if n == 0 or extended[order[n]] != extended[order[n - 1]]:
+            rank += 1
+        ranked[order[n]] = rank
+    return ranked
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""Credible regions: Gaussians in the open, several hills, walls, and what holds of any points."""
+"""Credible regions: Gaussians in the open, several modes, walls, and what holds of any points."""
 
 import math
 from dataclasses import replace
@@ -134,7 +134,7 @@ def test_the_upright_ellipsoid_has_a_vertical_axis() -> None:
     np.testing.assert_allclose(shape[:2, :2] / shape[2, 2], COV[:2, :2] / COV[2, 2], rtol=1e-12)
 
 
-# --- hills, walls, outliers ------------------------------------------------------------------------------
+# --- modes, walls, outliers ------------------------------------------------------------------------------
 
 
 def two_hills() -> tuple[Array, Array, Array]:
@@ -152,7 +152,7 @@ def test_a_region_reaches_to_a_rival_where_its_probability_needs_that() -> None:
     assert most.holds(mean[1])
     assert regions.horizontal_radius(0.65) < 0.7
     assert 5.5 < regions.horizontal_radius(0.8) < 6.5
-    # As long as it must be and not as wide: across, the hills are much narrower than they are apart.
+    # As long as it must be and not as wide: across, the modes are much narrower than they are apart.
     lengths = np.linalg.norm(most.semi_axes, axis=1)
     assert lengths[0] > 6.0
     assert lengths[1] < 0.3 * lengths[0]
@@ -160,7 +160,7 @@ def test_a_region_reaches_to_a_rival_where_its_probability_needs_that() -> None:
 
 @pytest.mark.parametrize("probability", [0.5, 0.65, 0.9, 0.97])
 def test_regions_hold_their_share_of_the_posterior(probability: float) -> None:
-    """By samples of the posterior itself, of two hills and of forty Gaussians among solids."""
+    """By samples of the posterior itself, of two modes and of forty Gaussians among solids."""
     rng = np.random.default_rng(3)
     root = rng.standard_normal((40, 3, 3)) + np.eye(3)
     free = rng.random((20, 20, 10)) < 0.7

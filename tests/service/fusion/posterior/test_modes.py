@@ -43,7 +43,7 @@ class Hills(NamedTuple):
     member: NDArray[np.int64]
 
 
-def hills_of(weight: Array, mean: Array, cov: Array, free_space: FreeSpace) -> Hills:
+def modes_of(weight: Array, mean: Array, cov: Array, free_space: FreeSpace) -> Hills:
     space = free_space.origin, free_space.voxel_size, free_space.free
     return Hills(*modes.find_modes(np.log(weight), mean, cov, *space, NEVER.cell))
 
@@ -114,7 +114,7 @@ def test_cutting_agrees_with_sampling_among_random_solids() -> None:
 def test_far_hypotheses_are_candidates_of_their_own() -> None:
     weight, mean = np.array([0.3, 0.7]), np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 1.0]])
     cov = np.array([np.diag([0.1, 0.2, 0.3]), np.diag([0.3, 0.1, 0.1])])
-    modes = hills_of(weight, mean, cov, ANYWHERE)
+    modes = modes_of(weight, mean, cov, ANYWHERE)
     np.testing.assert_allclose(modes.probability, [0.7, 0.3], rtol=1e-12)
     np.testing.assert_allclose(modes.position, mean[::-1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(modes.cov, cov[::-1], rtol=0, atol=1e-12)
@@ -124,7 +124,7 @@ def test_far_hypotheses_are_candidates_of_their_own() -> None:
 def test_near_hypotheses_are_one_candidate_at_their_mean() -> None:
     weight, mean = np.array([0.4, 0.6]), np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
     cov = np.array([0.04 * np.eye(3), 0.09 * np.eye(3)])
-    modes = hills_of(weight, mean, cov, ANYWHERE)
+    modes = modes_of(weight, mean, cov, ANYWHERE)
     np.testing.assert_allclose(modes.probability, [1.0], rtol=1e-12)
     np.testing.assert_allclose(modes.position, [[0.3, 0.0, 0.0]], rtol=0, atol=1e-12)
     # 0.4 (0.04 + 0.3^2) + 0.6 (0.09 + 0.2^2) along x
@@ -184,7 +184,7 @@ def test_candidates_are_in_the_free_space_and_in_order(seed: int) -> None:
     rng = np.random.default_rng(seed)
     free_space = FreeSpace(origin=np.full(3, -3.0), voxel_size=0.25, free=rng.random((24, 24, 24)) < 0.1)
     weight, mean, cov = random_mixture(seed, 30)
-    modes = hills_of(weight, mean, cov, free_space)
+    modes = modes_of(weight, mean, cov, free_space)
     assert free_space.contains(modes.position).all()
     assert modes.probability.sum() == pytest.approx(1.0, abs=1e-12)
     assert (np.diff(modes.probability) <= 0.0).all()
@@ -201,18 +201,18 @@ def test_candidates_are_in_the_free_space_and_in_order(seed: int) -> None:
 def test_a_candidate_far_from_any_free_space_goes_there_all_the_same() -> None:
     free_space = FreeSpace(origin=np.full(3, -3.0), voxel_size=0.25, free=np.zeros((24, 24, 24), np.bool_))
     free_space.free[0, 0, 0] = True
-    modes = hills_of(np.ones(1), np.array([[1.0, 0.5, 0.2]]), 0.01 * np.eye(3)[None], free_space)
+    modes = modes_of(np.ones(1), np.array([[1.0, 0.5, 0.2]]), 0.01 * np.eye(3)[None], free_space)
     np.testing.assert_allclose(modes.position, [[-2.75, -2.75, -2.75]], rtol=0, atol=1e-6)
     assert free_space.contains(modes.position).all()
 
 
 def test_on_both_sides_of_a_wall_the_likelier_side_is_told() -> None:
-    """Two humps of one hill, their mean within the wall, which is 0.2 m thick."""
+    """Two humps of one mode, their mean within the wall, which is 0.2 m thick."""
     free = np.ones((40, 40, 40), np.bool_)
     free[19:21] = False
     free_space = FreeSpace(origin=np.full(3, -2.0), voxel_size=0.1, free=free)
     weight, mean = np.array([0.45, 0.55]), np.array([[-0.2, 0.0, 0.0], [0.2, 0.0, 0.0]])
-    modes = hills_of(weight, mean, 0.02 * np.eye(3)[None].repeat(2, axis=0), free_space)
+    modes = modes_of(weight, mean, 0.02 * np.eye(3)[None].repeat(2, axis=0), free_space)
     assert len(modes.position) == 1
     assert free_space.contains(modes.position).all()
     assert 0.1 <= modes.position[0, 0] < 0.2
