@@ -12,6 +12,7 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
+import tomli_w
 from numpy.typing import NDArray
 
 from rayfix_tables.errors import RayfixError
@@ -131,15 +132,20 @@ def site_text(scene: str, bias: NDArray[np.float64], *, window_deg: float) -> st
     bias : ndarray of shape (n_anchors,), m
         Of each anchor's ranges.
     """
-    stations = "".join(
-        f'[[stations]]\nid = "a{n}"\nposition_m = [{x:g}, {y:g}, {z:g}]\nbias = {{ range_m = {bias[n]:.4f} }}\n'
-        for n, (x, y, z) in enumerate(ANCHORS)
-    )
-    return (
-        f'[site]\nname = "uwb"\nscene = "{scene}"\n'
-        "[propagation]\nmax_reflections = 0\nmax_path_length_m = 20.0\n"
-        f"[table]\nwindows_deg = [{window_deg:g}]\n{stations}"
-    )
+    document = {
+        "site": {"name": "uwb", "scene": scene},
+        "propagation": {"max_reflections": 0, "max_path_length_m": 20.0},
+        "table": {"windows_deg": [window_deg]},
+        "stations": [
+            {
+                "id": f"a{n}",
+                "position_m": [float(value) for value in position],
+                "bias": {"range_m": round(float(bias[n]), 4)},
+            }
+            for n, position in enumerate(ANCHORS)
+        ],
+    }
+    return tomli_w.dumps(document)
 
 
 def _read(path: Path, *, columns: int, skip: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

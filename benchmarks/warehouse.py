@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import tomli_w
+
 WAREHOUSE_SCENE = Path(__file__).parents[2] / "shared" / "data" / "warehouse" / "warehouse_collision.ply"
 
 WAREHOUSE_STATIONS = {
@@ -18,13 +20,11 @@ def write_warehouse(folder: Path) -> Path | None:
     """Write the warehouse's site file; None where its scene is missing."""
     if not WAREHOUSE_SCENE.exists():
         return None
-    stations = "".join(
-        f'[[stations]]\nid = "{name}"\nposition_m = {list(position)}\n' for name, position in WAREHOUSE_STATIONS.items()
-    )
+    document = {
+        "site": {"name": "warehouse", "scene": str(WAREHOUSE_SCENE.resolve())},
+        "stations": [{"id": name, "position_m": list(position)} for name, position in WAREHOUSE_STATIONS.items()],
+    }
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "site.toml"
-    path.write_text(
-        f'[site]\nname = "warehouse"\nscene = "{WAREHOUSE_SCENE.resolve()}"\n{stations}',
-        encoding="utf-8",
-    )
+    path.write_text(tomli_w.dumps(document), encoding="utf-8")
     return path

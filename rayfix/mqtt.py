@@ -8,11 +8,13 @@ from pathlib import Path
 from rayfix_service.adapters.adapted import check_stations
 from rayfix_service.adapters.mqtt import Broker, MqttSettings, check_settings, run_mqtt
 from rayfix_service.fusion.locator import Locator
+from rayfix_service.process_wide import logged_to_stderr
 from rayfix_tables.checked import open_checked
 
 _log = logging.getLogger(__name__)
 
 
+@logged_to_stderr()
 def serve_mqtt(table_path: Path, broker: Broker, settings: MqttSettings) -> None:
     """Locate from a broker until the process is told to end (SIGINT, SIGTERM).
 
@@ -25,7 +27,6 @@ def serve_mqtt(table_path: Path, broker: Broker, settings: MqttSettings) -> None
     BrokerError
         When a setting is out of range, or the broker cannot be used.
     """
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s: %(message)s")
     check_settings(settings)
     table = open_checked(table_path)
     check_stations(settings.stations, table.parts)

@@ -4,11 +4,9 @@ A third of a fix is Python, which one thread of a process runs at a time, so tha
 Each maps the table's file, which they therefore share in memory.
 """
 
-import gc
 import pickle
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,7 @@ from rayfix_service.fusion.measurements.checks import check_report
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.process_wide import collector_paused
 from rayfix_service.wire import parse_report
 from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import RayfixError, ReportError, TableError
@@ -54,7 +53,7 @@ def locate_batch(
     RayfixError
         When a process ends early.
     """
-    with _collector_resting():
+    with collector_paused():
         return _locate_all(locator, reports, jobs)
 
 
@@ -88,7 +87,7 @@ def _locate_block(locator: Locator, reports: Sequence[Report | Mapping[str, Any]
 
 def _locate_elsewhere(path: Path, table_id: str, settings: FusionSettings, packed: bytes) -> bytes:
     """Locate pickled reports; joblib's own pickler asks Python about each object, which takes longer than its fix."""
-    with _collector_resting():
+    with collector_paused():
         return pickle.dumps(_locate_block(_locator(path, table_id, settings), pickle.loads(packed)))
 
 
@@ -99,18 +98,3 @@ def _locator(path: Path, table_id: str, settings: FusionSettings) -> Locator:
     if table.table_id != table_id:
         raise TableError(f"{path} has become another table since it was opened; open it again")
     return Locator(table, settings)
-
-
-@contextmanager
-def _collector_resting() -> Iterator[None]:
-    """Keep Python's collector of reference cycles from looking for them among answers, again and again as these grow.
-
-    Answers have none. The search through thousands of them takes a fifth of the time of a batch in several processes.
-    """
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()

@@ -1,14 +1,16 @@
 """Runs spread over processes; results do not depend on their number."""
 
-import multiprocessing
 import os
+import pickle
 import threading
+import time
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 
 import numpy as np
+from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
@@ -17,10 +19,13 @@ from rayfix_evaluation.studies.cases import Case
 from rayfix_evaluation.studies.summary import Run
 from rayfix_tables.errors import RayfixError
 
-__all__ = ["Done", "Task", "end_with_parent", "run_tasks"]
+__all__ = ["Done", "Task", "end_with", "run_tasks"]
 
 _CHUNK = 10
 """Drops that a process gets at a time."""
+
+_WATCH_SECONDS = 1.0
+"""After so long at most, a process notices that its parent has ended."""
 
 _bench: Bench | None = None
 
@@ -72,9 +77,7 @@ def run_tasks(
     RayfixError
         When a process ends before its work is done.
     """
-    jobs = (os.cpu_count() or 1) if jobs == -1 else jobs
-    if not tasks:
-        return
+    jobs = effective_n_jobs(jobs)
     if jobs == 1:
         bench = Bench(settings)
         with threadpool_limits(limits=1):
@@ -83,60 +86,73 @@ def run_tasks(
                 advance(task.method, len(task.drops))
                 yield Done(task=task, run=run, seconds=seconds)
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, initializer=_start, initargs=(settings,)) as pool:
-        try:
-            yield from _spread(pool, tasks, advance)
-        except BrokenProcessPool as error:
-            raise RayfixError(
-                "a process of the evaluation ended early, as it does when memory runs out; run the same command again "
-                "with fewer --jobs: finished work is kept"
-            ) from error
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    parallel = Parallel(
+        n_jobs=jobs,
+        backend="loky",
+        return_as="generator_unordered",
+        batch_size=1,
+        pre_dispatch="all",
+        max_nbytes=None,
+        initializer=_start,
+        initargs=(pickle.dumps(settings), os.getpid()),
+    )
+    try:
+        yield from _gathered(parallel, tasks, advance)
+    except BrokenProcessPool as error:
+        raise RayfixError(
+            "a process of the evaluation ended early, as it does when memory runs out; run the same command again "
+            "with fewer --jobs: finished work is kept"
+        ) from error
 
 
-def _spread(pool: ProcessPoolExecutor, tasks: Sequence[Task], advance: Callable[[str, int], None]) -> Iterator[Done]:
-    missing: list[int] = []
-    parts: list[list[tuple[Run, NDArray[np.float64]] | None]] = []
-    futures: dict[Future[tuple[Run, NDArray[np.float64]]], tuple[int, int, int]] = {}
-    for number, task in enumerate(tasks):
-        chunks = [task.drops[begin : begin + _CHUNK] for begin in range(0, len(task.drops), _CHUNK)]
-        missing.append(len(chunks))
-        parts.append([None] * len(chunks))
-        for place, chunk in enumerate(chunks):
-            futures[pool.submit(_run, task.case, task.method, chunk)] = (number, place, len(chunk))
-    for future in as_completed(futures):
-        number, place, count = futures[future]
-        parts[number][place] = future.result()
+def _gathered(parallel: Parallel, tasks: Sequence[Task], advance: Callable[[str, int], None]) -> Iterator[Done]:
+    """Run the tasks in pieces of a few drops, and put the pieces together again."""
+    pieces = [
+        (number, begin, task.drops[begin : begin + _CHUNK])
+        for number, task in enumerate(tasks)
+        for begin in range(0, len(task.drops), _CHUNK)
+    ]
+    missing = Counter(number for number, _, _ in pieces)
+    parts: dict[int, dict[int, tuple[Run, NDArray[np.float64]]]] = defaultdict(dict)
+    calls = (delayed(_run)(n, begin, tasks[n].case, tasks[n].method, drops) for n, begin, drops in pieces)
+    for number, begin, run, seconds in parallel(calls):
+        task = tasks[number]
+        parts[number][begin] = run, seconds
         missing[number] -= 1
-        advance(tasks[number].method, count)
+        advance(task.method, len(seconds))
         if not missing[number]:
-            found = [part for part in parts[number] if part is not None]
-            parts[number] = []
-            run = Run.joined([run for run, _ in found])
-            yield Done(task=tasks[number], run=run, seconds=np.concatenate([seconds for _, seconds in found]))
+            found = [part for _, part in sorted(parts.pop(number).items(), key=lambda item: item[0])]
+            joined = Run.joined([run for run, _ in found])
+            yield Done(task=task, run=joined, seconds=np.concatenate([seconds for _, seconds in found]))
 
 
-def end_with_parent() -> None:
-    """End this process when the one that started it has ended, however that was: nobody waits for its results then."""
+def end_with(process: int) -> None:
+    """End this process when its parent has ended, however that was: nobody waits for its results then.
+
+    Parameters
+    ----------
+    process : int
+        Number of the parent.
+    """
 
     def watch() -> None:
-        parent = multiprocessing.parent_process()
-        if parent is not None:
-            parent.join()
-            os._exit(1)
+        while os.getppid() == process:
+            time.sleep(_WATCH_SECONDS)
+        os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _start(settings: BenchSettings) -> None:
+def _start(settings: bytes, parent: int) -> None:
+    """Prepare a process of the pool."""
     global _bench
-    end_with_parent()
+    end_with(parent)
     threadpool_limits(limits=1)
-    _bench = Bench(settings)
+    _bench = Bench(pickle.loads(settings))
 
 
-def _run(case: Case, method: str, drops: tuple[int, ...]) -> tuple[Run, NDArray[np.float64]]:
+def _run(
+    number: int, begin: int, case: Case, method: str, drops: tuple[int, ...]
+) -> tuple[int, int, Run, NDArray[np.float64]]:
     assert _bench is not None
-    return _bench.run(case, method, drops)
+    return number, begin, *_bench.run(case, method, drops)

@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import tomli_w
+
 from rayfix_evaluation.studies.store import write_text
 from rayfix_offline.build import build_table
 from rayfix_offline.site import SiteFile, read_site
@@ -72,7 +74,7 @@ def build_variants(
     site = read_site(site_path)
     found = {}
     for name in names:
-        text = _site_text(_variant(site, site_path, name, coarse))
+        text = tomli_w.dumps(_variant(site, site_path, name, coarse))
         changed = folder / f"{name}.toml"
         write_text(changed, text)
         found[name] = changed.with_suffix(".h5")
@@ -94,22 +96,6 @@ def _variant(site: SiteFile, site_path: Path, name: str, coarse: bool) -> dict[s
         document["propagation"]["path_prior"] = name
     document["table"]["windows_deg"] = [finest, *wider]
     return document
-
-
-def _site_text(document: dict[str, Any]) -> str:
-    """Write a site file; JSON's strings, numbers, truths and lists are TOML's as well."""
-    lines = []
-    for section, content in document.items():
-        for entry in content if isinstance(content, list) else [content]:
-            lines.append(f"[[{section}]]" if isinstance(content, list) else f"[{section}]")
-            lines.extend(f"{key} = {_value(value)}" for key, value in entry.items())
-    return "\n".join(lines) + "\n"
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_value(part)}" for key, part in value.items()) + " }"
-    return json.dumps(value)
 
 
 def _difference(wanted: Any, found: Any, where: str = "") -> str | None:

@@ -28,6 +28,7 @@ from rayfix_service.http.settings import ConnectionLimits, ServiceSettings
 from rayfix_service.http.telemetry.connections import Crowd
 from rayfix_service.http.telemetry.logs import LogFormat, log_config
 from rayfix_service.http.telemetry.metrics import MULTIPROCESS_VARIABLE, share_figures
+from rayfix_service.process_wide import logging_restored
 from rayfix_service.server.app import create_app
 from rayfix_service.server.protocol import GatheringProtocol, SocketProtocol
 from rayfix_service.server.workers import COULD_NOT_START, run_workers, tell_failure, tell_started
@@ -103,6 +104,7 @@ def serve(
         settings = replace(settings, hosts=(*settings.hosts, host))
     check_address(host, port)
     with ExitStack() as stack:
+        stack.enter_context(logging_restored())
         if workers > 1:
             settings = replace(settings, runtime_folder=stack.enter_context(_runtime_folder()))
         if MULTIPROCESS_VARIABLE in os.environ:
@@ -135,6 +137,7 @@ def serve(
             _log.warning(_TRACKS, workers)
         gc.collect()
         gc.freeze()  # a collection would write to what the workers share, and so copy it
+        stack.callback(gc.unfreeze)
         with config.bind_socket() as bound:
             run_workers(
                 partial(_work, config, bound),
@@ -175,7 +178,7 @@ def _run(config: uvicorn.Config, *bound: socket.socket) -> None:
     server = _Server(config)
     server.run(list(bound) or None)
     if not server.started:
-        sys.exit(COULD_NOT_START)
+        raise ServiceError("the service could not start; the log says why")
 
 
 class _Server(uvicorn.Server):
