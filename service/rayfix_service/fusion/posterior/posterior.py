@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.gaussians.definite import cholesky_factors
 from rayfix_tables.gaussians.normal_points import normal_points
 
 _NUM_POINTS = 4096
@@ -183,11 +184,9 @@ def free_shares(mean: Array, cov: Array, free_space: FreeSpace) -> Array:
     ----------
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
+        A Gaussian whose covariance is not positive definite has no share.
     """
     points = normal_points(_NUM_POINTS)
-    return np.array(
-        [
-            free_space.contains(centre + points @ root.T).mean()
-            for centre, root in zip(mean, np.linalg.cholesky(cov), strict=True)
-        ]
-    )
+    roots, definite = cholesky_factors(cov)
+    shares = [free_space.contains(centre + points @ root.T).mean() for centre, root in zip(mean, roots, strict=True)]
+    return np.where(definite, shares, 0.0)

@@ -52,14 +52,15 @@ def nearest_free(position: Any, cov: Any, reach: Any, origin: Any, voxel_size: A
     ----------
     position : ndarray of shape (3,), m
     cov : ndarray of shape (3, 3), m2
-        What near means.
+        What near means; nothing is, if it is not positive definite.
     reach : float
         Standard deviations along each axis of the box that is searched, which is wider by a voxel.
     origin, voxel_size, free
         As in :class:`~rayfix_tables.freespace.FreeSpace`.
     """
     lower, precision = np.empty((3, 3)), np.empty((3, 3))
-    cholesky(cov, lower)
+    if not cholesky(cov, lower):
+        return False
     invert(lower, precision)
     first, stop = np.empty(3, np.int64), np.empty(3, np.int64)
     for i in range(3):
