@@ -7,29 +7,27 @@ where it was; stations and cells of a former table that are still right are take
 import resource
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from joblib import Parallel, delayed
 
 from rayfix_offline.fit.normalise import balanced
+from rayfix_offline.job.engine import FittingEngine, Job
+from rayfix_offline.job.local import LocalEngine
 from rayfix_offline.job.method import Method
 from rayfix_offline.job.plan import StationPlan, plan_build
 from rayfix_offline.job.previous_table import read_former
 from rayfix_offline.job.shards import ShardStore
-from rayfix_offline.job.station import BuiltStation, Job, StationProgress, build_station, keep_station
+from rayfix_offline.job.station import BuiltStation, StationProgress, build_station, keep_station
 from rayfix_offline.rays.lost_rays import LOST_RAYS_WARNING
 from rayfix_offline.site import read_site
 from rayfix_offline.twin.twin import Twin, prepare_twin, refuse_errors
 from rayfix_tables.errors import BuildError
 from rayfix_tables.version import software_version
 from rayfix_tables.write import SceneContent, StationContent, check_writable, write_table
-
-if TYPE_CHECKING:
-    from rayfix_offline.job.cluster import Cluster
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, the cells that are done and the cells that there are in all (0 while not yet known)."""
@@ -185,13 +183,12 @@ def _build_stations(
     done = 0
     built: list[BuiltStation] = []
     with ExitStack() as stack:
-        remote: Cluster | None = None
+        engine: FittingEngine | None = None
         for plan in plans:
             station = keep_station(plan, job)
             if station is None:
-                if cluster is not None and remote is None:
-                    remote = stack.enter_context(_connect(cluster, job))
-                station = build_station(plan, job, remote, _after(done, total, report))
+                engine = engine or stack.enter_context(_start_engine(cluster, job))
+                station = build_station(plan, job, engine, _after(done, total, report))
             built.append(station)
             done += plan.num_cells
     report("balancing", done, total)
@@ -224,15 +221,17 @@ def _keeps_balance(station: BuiltStation) -> bool:
     return station.origin == "kept" and all(len(level.log_balance) == len(level.mixture) for level in levels)
 
 
-def _connect(address: str, job: Job) -> "Cluster":
-    """Connect to a cluster; only this needs Dask."""
+def _start_engine(cluster: str | None, job: Job) -> AbstractContextManager[FittingEngine]:
+    """Connect to a cluster, if one is named; only this needs Dask."""
+    if cluster is None:
+        return nullcontext(LocalEngine(job))
     try:
         from rayfix_offline.job.cluster import Cluster
     except ModuleNotFoundError as error:
         raise BuildError(
             f"the module '{error.name}' is not installed; install it with: pip install 'rayfix[cluster]'"
         ) from error
-    return Cluster(address, job.site, job.twin.scene, job.method)
+    return Cluster(cluster, job)
 
 
 def _lost_ray_warnings(plans: tuple[StationPlan, ...], contents: list[StationContent], twin: Twin) -> Iterator[str]:

@@ -16,8 +16,11 @@ from distributed import Client, as_completed
 from numpy.typing import NDArray
 
 from rayfix_offline.fit.cells import FittedCells, fit_cells, widen_cells
+from rayfix_offline.job.engine import FittedBlocks, Job
+from rayfix_offline.job.local import LocalEngine
 from rayfix_offline.job.method import Method
 from rayfix_offline.job.plan import BUILD_VERSION, Block, StationPlan
+from rayfix_offline.job.previous_table import FormerStation, KeptCells
 from rayfix_offline.job.shards import content_key
 from rayfix_offline.rays.trace import StationTrace, level_grid, trace_station
 from rayfix_offline.scene.scene import Scene
@@ -43,7 +46,7 @@ _lock = threading.Lock()
 
 
 class Cluster:
-    """A connection to a Dask scheduler. Use it as a context manager.
+    """A Dask scheduler's workers as a :class:`~rayfix_offline.job.engine.FittingEngine`. Use it as a context manager.
 
     Parameters
     ----------
@@ -56,7 +59,7 @@ class Cluster:
         When no scheduler answers, or it has no workers.
     """
 
-    def __init__(self, address: str, site: SiteFile, scene: Scene, method: Method) -> None:
+    def __init__(self, address: str, job: Job) -> None:
         try:
             self._client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -66,8 +69,9 @@ class Cluster:
         if not self._client.scheduler_info()["workers"]:
             self._client.close()
             raise BuildError(f"the Dask scheduler at {address} has no workers; start some with 'dask worker {address}'")
-        self._inputs: _Inputs = (site.model_dump(mode="json"), scene, method)
-        self._inputs_id = content_key(self._inputs[0], scene.sha256, method.identity())
+        self._local = LocalEngine(job)
+        self._inputs: _Inputs = (job.site.model_dump(mode="json"), job.twin.scene, job.method)
+        self._inputs_id = content_key(self._inputs[0], job.twin.scene.sha256, job.method.identity())
 
     def __enter__(self) -> "Cluster":
         """Return the connection."""
@@ -77,18 +81,24 @@ class Cluster:
         """Close the connection; tasks that are under way are given up."""
         self._client.close()
 
+    def keep(self, plan: StationPlan, former: FormerStation) -> KeptCells:
+        """Compare in this process, for which both scenes are traced here."""
+        return self._local.keep(plan, former)
+
     def launch(self, plan: StationPlan) -> dict[str, Any]:
-        """Trace a station's rays on a worker and return what :meth:`StationTrace.to_arrays` gives.
+        """Trace a station's rays on a worker, unless they were traced here to compare them.
 
         Raises
         ------
         BuildError
             When it fails.
         """
+        if self._local.has_traced(plan):
+            return self._local.launch(plan)
         ((_, arrays),) = self._run(plan, {"launch": (_launch_remotely, ())})
         return arrays
 
-    def fit_blocks(self, plan: StationPlan, blocks: list[Block]) -> Iterator[tuple[Block, FittedCells]]:
+    def fit_blocks(self, plan: StationPlan, blocks: list[Block]) -> FittedBlocks:
         """Fit blocks of a station on all workers; they come back as they are ready.
 
         Raises
@@ -103,7 +113,7 @@ class Cluster:
 
     def widen_blocks(
         self, plan: StationPlan, blocks: list[Block], finer: Level, finer_change: NDArray[np.float32]
-    ) -> Iterator[tuple[Block, FittedCells]]:
+    ) -> FittedBlocks:
         """Make blocks of a wide level on all workers; they come back as they are ready.
 
         Raises

@@ -1,12 +1,12 @@
 """Triangles that are in a mesh twice: they would make the inside of a solid its outside."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.scene.scene import Scene
-from rayfix_offline.twin.topology import Topology
+from rayfix_offline.twin.mesh import Mesh
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,12 +29,13 @@ class Repeats:
     coinciding: tuple[tuple[str, str], ...]
 
 
-def find_repeats(scene: Scene, topology: Topology) -> Repeats:
-    """Find the triangles that are in the scene more than once.
+def find_repeats(mesh: Mesh) -> Repeats:
+    """Find the triangles that are in a mesh more than once; :meth:`Mesh.without` leaves the needless ones out.
 
     Two triangles back to back within an object stay, where others of the part have none: boxes that touch are drawn
     like that.
     """
+    scene, topology = mesh.scene, mesh.topology
     count = len(scene.faces)
     # Two edges of a triangle determine it.
     low, high = topology.edges.min(axis=1), topology.edges.max(axis=1)
@@ -60,16 +61,6 @@ def find_repeats(scene: Scene, topology: Topology) -> Repeats:
         num_copies=int(np.count_nonzero(copies)),
         num_backs=int(np.count_nonzero(backs)),
         coinciding=_coinciding(scene, sided[left], scene.face_objects[left]),
-    )
-
-
-def without(scene: Scene, faces: NDArray[np.bool_]) -> Scene:
-    """Return a scene without some of its triangles."""
-    return replace(
-        scene,
-        faces=scene.faces[~faces],
-        face_materials=scene.face_materials[~faces],
-        face_objects=scene.face_objects[~faces],
     )
 
 

@@ -12,8 +12,8 @@ from scipy import ndimage
 from trimesh.triangles import closest_point
 
 from rayfix_offline.scene.scene import Scene
+from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.settings import TwinSettings
-from rayfix_offline.twin.topology import Topology
 from rayfix_tables.freespace import FreeSpace
 
 
@@ -48,12 +48,13 @@ class Part:
     middle: tuple[float, float, float]
 
 
-def split_parts(scene: Scene, topology: Topology) -> tuple[Part, ...]:
-    """Cut the scene into connected parts, in the order of their first triangles.
+def split_parts(mesh: Mesh) -> tuple[Part, ...]:
+    """Cut a mesh into connected parts, in the order of their first triangles.
 
     What hangs together within an object and is closed is a part. The rest hangs together across objects: a room may
     be drawn as six sheets.
     """
+    scene, topology = mesh.scene, mesh.topology
     label = topology.components(scene.face_objects)
     odd = (topology.uses_within(label)[0] % 2 == 1).any(axis=1)
     loose = np.flatnonzero((np.bincount(label, weights=odd) > 0)[label])

@@ -11,29 +11,29 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.planes import Planes
 from rayfix_offline.twin.settings import TwinSettings
-from rayfix_offline.twin.topology import Topology, connect
+from rayfix_offline.twin.topology import connect
 
 
 def join_facets(
-    triangles: NDArray[np.float64],
+    mesh: Mesh,
     planes: Planes,
-    topology: Topology,
     *,
     surface_angle: float = TwinSettings.surface_angle,
     facet_size: float = TwinSettings.facet_size,
 ) -> Planes:
-    """Find the curved surfaces of a scene.
+    """Find the curved surfaces of a mesh.
 
     Small facets that share an edge make up a surface, as far as their normals stay within ``surface_angle`` of the
     first one's.
 
     Parameters
     ----------
-    triangles : ndarray of shape (n_faces, 3, 3), m
+    mesh : Mesh
     planes : Planes
-        Of the triangles.
+        Of its triangles.
     surface_angle : float, rad
     facet_size : float, m
         See :class:`~rayfix_offline.twin.settings.TwinSettings`.
@@ -44,7 +44,8 @@ def join_facets(
         With facets of different surfaces apart, even where they happen to be coplanar; the very same ``planes`` where
         nothing is curved.
     """
-    first, second = topology.neighbours()
+    triangles = mesh.scene.triangles
+    first, second = mesh.topology.neighbours()
     faces = np.stack([first // 3, second // 3], axis=1)
     flat = planes.face_planes[faces[:, 0]] == planes.face_planes[faces[:, 1]]
     small = _patch_sizes(triangles, faces[flat], np.concatenate([first[flat], second[flat]])) <= facet_size

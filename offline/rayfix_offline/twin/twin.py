@@ -8,7 +8,7 @@ import numpy as np
 from rayfix_offline.scene.engine import EmbreeEngine, RayEngine
 from rayfix_offline.scene.scene import Scene, load_scene
 from rayfix_offline.site import SiteFile
-from rayfix_offline.twin.cleaning import find_repeats, without
+from rayfix_offline.twin.cleaning import find_repeats
 from rayfix_offline.twin.enclosures import find_enclosures
 from rayfix_offline.twin.findings import (
     Finding,
@@ -18,11 +18,11 @@ from rayfix_offline.twin.findings import (
     size_findings,
     station_findings,
 )
+from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.planes import Planes, merge_coplanar
 from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.solids import map_free_space, sealed_space, split_parts
 from rayfix_offline.twin.surfaces import join_facets
-from rayfix_offline.twin.topology import find_topology
 from rayfix_tables.errors import SceneError
 from rayfix_tables.freespace import FreeSpace
 
@@ -60,12 +60,10 @@ def prepare_twin(site: SiteFile, folder: Path, settings: TwinSettings | None = N
 def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = None) -> Twin:
     """Check a scene that is loaded already; see :func:`prepare_twin`."""
     settings = settings or TwinSettings()
-    topology = find_topology(scene, weld=settings.weld)
-    repeats = find_repeats(scene, topology)
-    if repeats.needless.any():
-        scene = without(scene, repeats.needless)
-        topology = find_topology(scene, weld=settings.weld)
-    parts = split_parts(scene, topology)
+    mesh = Mesh(scene=scene, weld=settings.weld)
+    repeats = find_repeats(mesh)
+    mesh = mesh.without(repeats.needless)
+    scene, parts = mesh.scene, split_parts(mesh)
     stations = np.array([station.position_m for station in site.stations])
     enclosures = find_enclosures(scene, parts, stations, settings)
     free_space = map_free_space(
@@ -91,13 +89,7 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
     planes = merge_coplanar(scene.triangles, tolerance=settings.plane_tolerance, rounding=settings.plane_rounding)
     return Twin(
         scene=scene,
-        planes=join_facets(
-            scene.triangles,
-            planes,
-            topology,
-            surface_angle=settings.surface_angle,
-            facet_size=settings.facet_size,
-        ),
+        planes=join_facets(mesh, planes, surface_angle=settings.surface_angle, facet_size=settings.facet_size),
         engine=EmbreeEngine(scene.triangles),
         free_space=free_space,
         closed=closed,

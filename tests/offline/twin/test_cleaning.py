@@ -9,9 +9,9 @@ import pytest
 import trimesh
 
 from rayfix_offline.scene.scene import Scene
-from rayfix_offline.twin.cleaning import find_repeats, without
+from rayfix_offline.twin.cleaning import find_repeats
+from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.solids import split_parts
-from rayfix_offline.twin.topology import find_topology
 from tests.support.rooms import scene_of, twin_of
 from tests.support.shapes import box
 
@@ -20,11 +20,12 @@ WriteSite = Callable[..., Path]
 
 def cleaned(scene: Scene) -> Scene:
     """Leave the needless triangles out."""
-    return without(scene, find_repeats(scene, find_topology(scene)).needless)
+    mesh = Mesh(scene=scene)
+    return mesh.without(find_repeats(mesh).needless).scene
 
 
 def test_a_sound_box_has_none() -> None:
-    repeats = find_repeats(scene := scene_of(crate=box((0, 0, 0), (1, 2, 3))), find_topology(scene))
+    repeats = find_repeats(Mesh(scene=scene_of(crate=box((0, 0, 0), (1, 2, 3)))))
     assert not repeats.needless.any()
     assert (repeats.num_copies, repeats.num_backs, repeats.coinciding) == (0, 0, ())
 
@@ -33,7 +34,7 @@ def test_copies_are_left_out_whatever_corner_they_begin_at() -> None:
     crate = box((0, 0, 0), (1, 2, 3))
     scene = scene_of(crate=np.concatenate([crate, np.roll(crate[[3, 7]], 1, axis=1), crate[[3]]]))
     scene = replace(scene, face_materials=np.arange(15, dtype=np.int16))
-    repeats = find_repeats(scene, find_topology(scene))
+    repeats = find_repeats(Mesh(scene=scene))
     assert np.flatnonzero(repeats.needless).tolist() == [12, 13, 14]
     assert (repeats.num_copies, repeats.num_backs) == (3, 0)
     left = cleaned(scene)
@@ -44,8 +45,8 @@ def test_copies_are_left_out_whatever_corner_they_begin_at() -> None:
 def test_a_box_drawn_from_both_sides_is_solid_again() -> None:
     crate = box((0, 0, 0), (1, 2, 3))
     scene = scene_of(crate=np.concatenate([crate, crate[:, ::-1]]))
-    assert find_repeats(scene, find_topology(scene)).num_backs == 12
-    (part,) = split_parts(left := cleaned(scene), find_topology(left))
+    assert find_repeats(Mesh(scene=scene)).num_backs == 12
+    (part,) = split_parts(Mesh(scene=cleaned(scene)))
     assert part.closed
     assert part.volume == pytest.approx(6.0, rel=1e-12)
 
@@ -54,7 +55,7 @@ def test_boxes_back_to_back_keep_the_face_between_them() -> None:
     """The two squares at x = 1 are one the back side of the other."""
     two = np.concatenate([box((0, 0, 0), (1, 1, 1)), box((1, 0, 0), (2, 1, 1))])
     for scene in (scene_of(both=two), scene_of(one=two[:12], other=two[12:])):
-        repeats = find_repeats(scene, find_topology(scene))
+        repeats = find_repeats(Mesh(scene=scene))
         assert not repeats.needless.any()
         assert repeats.coinciding == ()
 
@@ -62,7 +63,7 @@ def test_boxes_back_to_back_keep_the_face_between_them() -> None:
 def test_objects_that_coincide_are_named_and_stay() -> None:
     crate = box((0, 0, 0), (1, 2, 3))
     scene = scene_of(crate=crate, copy=crate, other=box((5, 0, 0), (6, 1, 1)))
-    repeats = find_repeats(scene, find_topology(scene))
+    repeats = find_repeats(Mesh(scene=scene))
     assert not repeats.needless.any()
     assert repeats.coinciding == (("crate", "copy"),)
 

@@ -9,8 +9,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from rayfix_offline.twin.enclosures import find_enclosures
+from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.solids import split_parts
-from rayfix_offline.twin.topology import find_topology
 from tests.support.rooms import scene_of, twin_of
 from tests.support.shapes import box
 
@@ -21,7 +21,7 @@ Point = tuple[float, float, float]
 def kinds(objects: dict[str, NDArray[np.float64]], *stations: Point) -> dict[str, str]:
     """Say of each object whether it is a room, a shell around rooms, or a solid."""
     scene = scene_of(**objects)
-    parts = split_parts(scene, find_topology(scene))
+    parts = split_parts(Mesh(scene=scene))
     found = find_enclosures(scene, parts, np.array(stations))
     return {
         part.name: "room" if room else "shell" if encloses else "solid"

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from rayfix_offline.scene.scene import Scene
 from rayfix_offline.twin.enclosures import find_enclosures
+from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.solids import Part, is_inside, map_free_space, split_parts, touched
-from rayfix_offline.twin.topology import find_topology
 from rayfix_tables.freespace import FreeSpace
 from tests.support.rooms import scene_of
 from tests.support.shapes import box
@@ -24,7 +24,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 def parts_of(scene: Scene) -> tuple[Part, ...]:
     """Split a scene."""
-    return split_parts(scene, find_topology(scene))
+    return split_parts(Mesh(scene=scene))
 
 
 def moved(triangles: NDArray[np.float64], rotation: Rotation, shift: NDArray[np.float64]) -> NDArray[np.float64]:

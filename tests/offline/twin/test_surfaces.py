@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.planes import Planes, merge_coplanar
 from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.surfaces import join_facets
-from rayfix_offline.twin.topology import find_topology, number_rows
+from rayfix_offline.twin.topology import number_rows
 from tests.support.rooms import scene_of
 from tests.support.shapes import box
 
@@ -23,7 +24,7 @@ Triangles = NDArray[np.float64]
 def joined(triangles: Triangles) -> tuple[Planes, Planes]:
     """Planes before and after facets are joined."""
     planes = merge_coplanar(triangles)
-    return planes, join_facets(triangles, planes, find_topology(scene_of(mesh=triangles)))
+    return planes, join_facets(Mesh(scene=scene_of(mesh=triangles)), planes)
 
 
 def surfaces_of(triangles: Triangles) -> NDArray[np.int32]:

@@ -199,9 +199,13 @@ def _second_moment(apart: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _squared_distances(apart: Any, cov: Any) -> Any:
-    """Squares of the Mahalanobis distances of points from the place from which they are counted, shape (k,)."""
+    """Squares of the Mahalanobis distances of points from the place from which they are counted, shape (k,).
+
+    They are infinite if the covariance is not positive definite: no ellipsoid of that shape reaches a point.
+    """
     lower = np.empty((3, 3))
-    cholesky(cov, lower)
+    if not cholesky(cov, lower):
+        return np.full(apart.shape[1], np.inf)
     xx, yx, yy, zx, zy, zz = lower[0, 0], lower[1, 0], lower[1, 1], lower[2, 0], lower[2, 1], lower[2, 2]
     squares = np.empty(apart.shape[1])
     for n in range(len(squares)):

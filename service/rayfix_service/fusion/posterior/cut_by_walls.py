@@ -35,14 +35,17 @@ def cut_to_free_space(
     Returns
     -------
     log_weight, mean, cov : ndarray
-        A Gaussian without any points in the free space keeps its moments, and one with few its covariance.
+        A Gaussian without any points in the free space keeps its moments, and one with few its covariance. One whose
+        covariance is not positive definite loses all of its weight.
     """
     log_weight, mean, cov = log_weight.copy(), mean.copy(), cov.copy()
     lower, second = np.zeros((3, 3)), np.empty((3, 3))
     first = np.empty(3)
     inside = np.empty(len(points), np.int64)
     for h in range(len(mean)):
-        cholesky(cov[h], lower)
+        if not cholesky(cov[h], lower):
+            log_weight[h] = -np.inf
+            continue
         (x, y, z), (xx, yx, yy, zx, zy, zz) = in_voxels(mean[h], lower, origin, voxel_size)
         count = 0
         for n in range(len(points)):

@@ -25,6 +25,7 @@ def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
         Natural logarithms; the weights sum to 1.
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
+        A Gaussian whose covariance is not positive definite is left out with its weight.
     origin, voxel_size, free
         As in :class:`~rayfix_tables.freespace.FreeSpace`.
     stop : ndarray of uint8, shape (1,)
@@ -41,15 +42,47 @@ def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
     member : ndarray of int64, shape (h,)
         Mode of each Gaussian.
     """
-    count = len(log_weight)
-    log_density = np.empty(count)
-    precision, lower = np.empty((count, 3, 3)), np.empty((3, 3))
-    for h in range(count):
-        cholesky(cov[h], lower)
-        invert(lower, precision[h])
-        log_density[h] = log_weight[h] - np.log(lower[0, 0] * lower[1, 1] * lower[2, 2])
+    definite = np.zeros(len(log_weight), np.bool_)
+    log_density = np.empty(len(log_weight))
+    precision, lower = np.empty((len(log_weight), 3, 3)), np.empty((3, 3))
+    for h in range(len(log_weight)):
+        if cholesky(cov[h], lower):
+            definite[h] = True
+            invert(lower, precision[h])
+            log_density[h] = log_weight[h] - np.log(lower[0, 0] * lower[1, 1] * lower[2, 2])
+    which = np.flatnonzero(definite)
+    return _modes(
+        log_density[which],
+        np.exp(log_weight[which]),
+        mean[which],
+        cov[which],
+        precision[which],
+        which,
+        len(log_weight),
+        origin,
+        voxel_size,
+        free,
+        stop,
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _modes(
+    log_density: Any,
+    weight: Any,
+    mean: Any,
+    cov: Any,
+    precision: Any,
+    which: Any,
+    total: Any,
+    origin: Any,
+    voxel_size: Any,
+    free: Any,
+    stop: Any,
+) -> Any:
+    """Find the modes of Gaussians that are ``which`` of a ``total``; those left out count as the first mode's."""
+    count = len(weight)
     top, member = gather(log_density, mean, precision, _SAME_MODE, stop)
-    weight = np.exp(log_weight)
     probability, position = np.zeros(len(top)), np.zeros((len(top), 3))
     for h in range(count):
         probability[member[h]] += weight[h]
@@ -69,8 +102,10 @@ def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
     order = np.argsort(-probability, kind="mergesort")
     rank = np.empty(len(top), np.int64)
     rank[order] = np.arange(len(top))
+    member_of_all = np.zeros(total, np.int64)
+    member_of_all[which] = rank[member]
     # A sum of rounded numbers may be a little more than 1.
-    return np.minimum(probability[order], 1.0), position[order], moment[order], rank[member]
+    return np.minimum(probability[order], 1.0), position[order], moment[order], member_of_all
 
 
 @numba.njit(cache=True, nogil=True)
@@ -203,7 +238,8 @@ def climb(log_density: Any, mean: Any, precision: Any, start: Any, top: Any, cur
         matrix[0, 1], matrix[0, 2], matrix[1, 2] = yx, zx, zy
         matrix[1, 0], matrix[2, 0], matrix[2, 1] = yx, zx, zy
         vector[0], vector[1], vector[2] = px, py, pz
-        cholesky(matrix, lower)
+        if not cholesky(matrix, lower):
+            break
         solve(lower, vector, step)
         x += step
         matrix /= total

@@ -131,5 +131,6 @@ def draw_points(log_weight: Any, mean: Any, cov: Any, normal: Any, origin: Any, 
         owner[:] = 0
         owners = 1
         chosen[0] = mean[0]
-        cholesky(cov[0], root[0])
+        if not cholesky(cov[0], root[0]):
+            root[0] = 0.0
     return chosen[:owners].copy(), root[:owners].copy(), owner

@@ -15,6 +15,7 @@ from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.gaussians.definite import cholesky_factors
 from rayfix_tables.gaussians.normal_points import normal_points
 
 _NUM_POINTS = 4096
@@ -193,6 +194,7 @@ def free_shares(mean: Array, cov: Array, free_space: FreeSpace, stop: Stop = NEV
     ----------
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
+        A Gaussian whose covariance is not positive definite has no share.
     stop : Stop
         Ends it early.
 
@@ -202,8 +204,9 @@ def free_shares(mean: Array, cov: Array, free_space: FreeSpace, stop: Stop = NEV
         When it was.
     """
     points = normal_points(_NUM_POINTS)
-    shares = np.empty(len(mean))
-    for h, (centre, root) in enumerate(zip(mean, np.linalg.cholesky(cov), strict=True)):
+    roots, definite = cholesky_factors(cov)
+    shares = np.zeros(len(mean))
+    for h in np.flatnonzero(definite):
         stop.check()
-        shares[h] = free_space.contains(centre + points @ root.T).mean()
+        shares[h] = free_space.contains(mean[h] + points @ roots[h].T).mean()
     return shares

@@ -58,12 +58,13 @@ def nearest_free(position: Any, cov: Any, origin: Any, voxel_size: Any, free: An
     ----------
     position : ndarray of shape (3,), m
     cov : ndarray of shape (3, 3), m2
-        What near means.
+        What near means; nothing is, if it is not positive definite.
     origin, voxel_size, free
         As in :class:`~rayfix_tables.freespace.FreeSpace`.
     """
     lower, precision = np.empty((3, 3)), np.empty((3, 3))
-    cholesky(cov, lower)
+    if not cholesky(cov, lower):
+        return False
     invert(lower, precision)
     trace = cov[0, 0] + cov[1, 1] + cov[2, 2]
     nx, ny, nz = free.shape

@@ -1,0 +1,44 @@
+"""The mesh of a scene: its triangles, and how they are connected."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_offline.scene.scene import Scene
+from rayfix_offline.twin.settings import TwinSettings
+from rayfix_offline.twin.topology import Topology, find_topology
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mesh:
+    """Triangles of a scene with their topology. Each step of a repair takes one and returns another.
+
+    Attributes
+    ----------
+    scene : Scene
+    weld : float, m
+        Vertices whose coordinates round to the same multiple of this are one point.
+    """
+
+    scene: Scene
+    weld: float = TwinSettings.weld
+
+    @cached_property
+    def topology(self) -> Topology:
+        """Points and edges of the triangles."""
+        return find_topology(self.scene, weld=self.weld)
+
+    def without(self, faces: NDArray[np.bool_]) -> "Mesh":
+        """Leave out triangles, given by a mask of shape (n_faces,)."""
+        if not faces.any():
+            return self
+        scene = self.scene
+        left = replace(
+            scene,
+            faces=scene.faces[~faces],
+            face_materials=scene.face_materials[~faces],
+            face_objects=scene.face_objects[~faces],
+        )
+        return replace(self, scene=left)
