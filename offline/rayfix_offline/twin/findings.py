@@ -88,6 +88,12 @@ def size_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
         )
 
 
+def file_findings(scene: Scene) -> Iterator[Finding]:
+    """Tell what the scene file's reader left out, or could not take as it stands."""
+    for remark in scene.remarks:
+        yield warning(remark.kind, remark.problem, remark.remedy)
+
+
 def mesh_findings(scene: Scene, repeats: Repeats, parts: Sequence[Part], enclosures: Enclosures) -> Iterator[Finding]:
     """Find triangles and parts that a clean mesh does not have."""
     if scene.num_degenerate:
