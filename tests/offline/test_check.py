@@ -107,3 +107,23 @@ def test_the_command(tmp_path: Path, write_site: WriteSite, capsys: pytest.Captu
     assert document["scene"]["closed"] is True
     assert document["scene"]["size_m"] == [4.0, 5.0, 3.0]
     assert document["scene"]["triangles"] == 36
+
+
+@pytest.mark.parametrize(("distance", "severity"), [(50_000.0, "warning"), (5_412_330.0, "error")])
+def test_a_sound_scene_on_map_coordinates_has_no_holes(distance: float, severity: str, tmp_path: Path) -> None:
+    """The one finding says in which steps a table would hold positions there, and how to move."""
+    corners = [(x + 300.0, y + distance, z) for x in (0.0, 4.0) for y in (0.0, 5.0) for z in (0.0, 3.0)]
+    faces = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in corners] + [f"f {face}" for face in faces]
+    (tmp_path / "room.obj").write_text("\n".join(lines))
+    (tmp_path / "site.toml").write_text(
+        '[site]\nname = "a"\nscene = "room.obj"\n[propagation]\nmax_reflections = 2\n'
+        f'[[stations]]\nid = "s"\nposition_m = [303.6, {distance + 0.4}, 2.6]\n'
+    )
+    check = check_site(tmp_path / "site.toml")
+    (finding,) = check.findings
+    assert (finding.kind, finding.severity) == ("origin", severity)
+    step = float(np.spacing(np.float32(distance)))
+    assert f"in steps of {step:.3g} m" in finding.problem
+    assert f"by (-302, {-round(distance + 2.5)}, -2) m" in finding.remedy
+    assert [escapes.share for escapes in check.escapes] == [0.0]

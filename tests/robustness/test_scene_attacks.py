@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from rayfix_offline.scene import mitsuba, scene, xml_limits
+from rayfix_offline.scene import scene
+from rayfix_offline.scene.formats import mitsuba, xml_limits
 from rayfix_offline.scene.scene import load_scene
 from rayfix_offline.site import LARGEST_COORDINATE, read_site
 from rayfix_offline.twin.twin import prepare_twin
@@ -345,7 +346,9 @@ def test_a_material_file_that_came_along_is_found_under_its_former_path(folder: 
         assert load_scene(folder / "scene.obj").materials == ("not-yours",)
 
 
-def test_textures_of_a_collada_file_stay_in_its_folder(folder: Path) -> None:
+def test_textures_of_a_collada_file_are_not_read(folder: Path) -> None:
+    """The texture is a pipe outside the folder: opened, it would wait for a writer for ever."""
+    os.mkfifo(folder.parent / "outside.png")
     images = '<library_images><image id="i"><init_from>../outside.png</init_from></image></library_images>'
     effect = """<library_effects><effect id="e"><profile_COMMON>
 <newparam sid="s"><surface type="2D"><init_from>i</init_from></surface></newparam>
@@ -355,7 +358,7 @@ def test_textures_of_a_collada_file_stay_in_its_folder(folder: Path) -> None:
 <library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>"""
     text = dae_of("1").replace("<library_geometries>", images + effect + "<library_geometries>", 1)
     (folder / "scene.dae").write_text(text)
-    assert "names the file '../outside.png'" in refused(folder / "scene.dae")
+    assert len(load_scene(folder / "scene.dae").faces) == 1
 
 
 def test_a_name_that_no_file_can_have_is_not_there(folder: Path) -> None:

@@ -48,6 +48,9 @@ def launch(
         A reflected ray starts this times (1 + largest coordinate in m) off its mirror.
     """
     num_rays = len(directions)
+    # All that single precision holds counts from the engine's origin; what is returned, from the scene's.
+    station, bounds = station - engine.origin, bounds - engine.origin
+    plane_offsets = planes.offsets - planes.normals @ engine.origin
     offset = mirror_offset * (1.0 + float(np.abs(bounds).max()))
     sequence = np.full((num_rays, max_reflections + 1), -1, np.int32)
     start = np.zeros(sequence.shape)
@@ -74,7 +77,7 @@ def launch(
             directions,
             planes.face_planes,
             planes.normals,
-            planes.offsets,
+            plane_offsets,
             bounds,
             offset,
             max_path_length,
@@ -107,7 +110,7 @@ def launch(
         end=end,
         log_gain=log_gain,
         sequences=Sequences(
-            images=np.concatenate([g.images for g in generations]),
+            images=np.concatenate([g.images for g in generations]) + engine.origin,
             mirrors=np.concatenate([g.mirrors for g in generations]),
             parents=np.concatenate([g.parents for g in generations]),
             planes=np.concatenate([g.planes for g in generations]),

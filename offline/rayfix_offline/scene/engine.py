@@ -7,9 +7,20 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
+FAR = 10_000.0
+"""Farther from the origin than this, m, single precision is coarser than a millimetre."""
+
 
 class RayEngine(Protocol):
-    """Finds first hits."""
+    """Finds first hits.
+
+    Attributes
+    ----------
+    origin : ndarray of shape (3,), m
+        Point of the scene that the engine's coordinates count from, so that single precision suffices for them.
+    """
+
+    origin: NDArray[np.float64]
 
     def first_hit(self, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.int32]:
         """Triangle that each ray hits first.
@@ -17,6 +28,7 @@ class RayEngine(Protocol):
         Parameters
         ----------
         origins : ndarray of shape (n_rays, 3), m
+            Relative to :attr:`origin`.
         directions : ndarray of shape (n_rays, 3)
             Unit vectors.
 
@@ -29,11 +41,19 @@ class RayEngine(Protocol):
 
 
 class EmbreeEngine:
-    """Intel Embree. It works in float32; whoever needs the hit point computes it from the triangle's plane."""
+    """Intel Embree. It works in float32; whoever needs the hit point computes it from the triangle's plane.
+
+    Scenes on map coordinates are moved next to the origin; all others stay where they are.
+    """
 
     def __init__(self, triangles: NDArray[np.float64]) -> None:
+        self.origin = np.zeros(3)
+        if len(triangles):
+            low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+            if max(np.abs(low).max(), np.abs(high).max()) > FAR:
+                self.origin = np.round((low + high) / 2.0)
         self._scene = EmbreeScene()
-        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles, dtype=np.float32))
+        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles - self.origin, dtype=np.float32))
 
     def first_hit(self, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.int32]:
         """See :meth:`RayEngine.first_hit`."""

@@ -1,32 +1,38 @@
 """The scene: a mesh file as triangles in metres, z up, with the objects and materials they belong to."""
 
-import contextlib
 import hashlib
-import io
-import logging
-import re
-import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
-from trimesh.units import unit_conversion
 
-from rayfix_offline.scene.gltf_limits import refuse_hostile_gltf
-from rayfix_offline.scene.ifc import read_ifc
-from rayfix_offline.scene.mitsuba import MOST_TRIANGLES, read_mitsuba
-from rayfix_offline.scene.placed import Placed
-from rayfix_offline.scene.scene_folder import SceneFolder, outside_error
-from rayfix_offline.scene.xml_limits import refuse_hostile_collada, refuse_hostile_xml
+from rayfix_offline.scene.formats.collada import read_collada
+from rayfix_offline.scene.formats.gltf import read_gltf
+from rayfix_offline.scene.formats.ifc import read_ifc
+from rayfix_offline.scene.formats.mitsuba import read_mitsuba
+from rayfix_offline.scene.formats.obj import read_obj
+from rayfix_offline.scene.formats.ply import read_ply
+from rayfix_offline.scene.formats.stl import read_stl
+from rayfix_offline.scene.placed import MOST_TRIANGLES, Contents, Placed, Remark
 from rayfix_offline.site import LARGEST_COORDINATE
 from rayfix_tables.errors import SceneError
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-FILE_TYPES = ("glb", "gltf", "obj", "ply", "stl", "dae", "xml", "ifc")
+
+READERS: dict[str, Callable[[Path], Contents]] = {
+    "glb": read_gltf,
+    "gltf": read_gltf,
+    "obj": read_obj,
+    "ply": read_ply,
+    "stl": read_stl,
+    "dae": read_collada,
+    "xml": read_mitsuba,
+    "ifc": read_ifc,
+}
+FILE_TYPES = tuple(READERS)
 
 UPRIGHT = {
     "x": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
@@ -55,6 +61,8 @@ class Scene:
         Triangles without an area, left out.
     says_up : bool
         The file itself said which axis points up.
+    remarks : tuple of Remark
+        What the file's reader left out, or could not take as it stands.
     """
 
     vertices: NDArray[np.float64]
@@ -65,6 +73,7 @@ class Scene:
     objects: tuple[str, ...]
     num_degenerate: int = 0
     says_up: bool = False
+    remarks: tuple[Remark, ...] = ()
 
     @cached_property
     def triangles(self) -> NDArray[np.float64]:
@@ -108,112 +117,62 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
     kind = path.suffix.lower().lstrip(".")
     if kind not in FILE_TYPES:
         raise SceneError(f"{path} is of unknown type '{kind}'; give one of {', '.join(FILE_TYPES)}")
-    scale, said_up = METRES_PER_UNIT[unit], None
-    if kind == "xml":
-        meshes = read_mitsuba(path, lambda mesh: _load_quietly(mesh, path.parent))
-    elif kind == "ifc":
-        meshes, scale, said_up = read_ifc(path), 1.0, "z"
-    else:
-        if kind == "dae":
-            content = path.read_bytes()
-            refuse_hostile_xml(path, content)
-            refuse_hostile_collada(path, content)
-        elif kind in ("glb", "gltf"):
-            refuse_hostile_gltf(path, path.read_bytes())
-        loaded = _load_quietly(path, path.parent)
-        meshes = _placed_meshes(loaded)
-        if kind == "dae":
-            # trimesh reads the unit of a COLLADA file (as "0.01 * meters"), but does not apply it.
-            scale = float(unit_conversion(loaded.units, "meters"))
-            said_up = _collada_up(path)
-    if not meshes:
-        raise SceneError(f"{path} holds no triangles; export the scene as a triangle mesh")
-    if not all(np.isfinite(mesh.vertices).all() and np.isfinite(transform).all() for _, mesh, transform in meshes):
+    try:
+        contents = READERS[kind](path)
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read ({error.strerror}); correct its permissions") from error
+    objects = [each for each in contents.objects if len(each.faces)]
+    if not objects:
+        told = "".join(f" ({remark.problem})" for remark in contents.remarks[:1])
+        raise SceneError(f"{path} holds no triangles{told}; export the scene as a triangle mesh")
+    scale = METRES_PER_UNIT[unit] if contents.metres is None else contents.metres
+    if not all(np.isfinite(each.vertices).all() and np.isfinite(each.transform).all() for each in objects):
         raise SceneError(f"{path} has coordinates that are not finite; export the scene again")
-    num_triangles = sum(len(mesh.faces) for _, mesh, _ in meshes)
+    num_triangles = sum(len(each.faces) for each in objects)
     if num_triangles > MOST_TRIANGLES:
         raise SceneError(
             f"{path} has {num_triangles:,} triangles, more than {MOST_TRIANGLES:,}; leave out what is small"
         )
-    _refuse_far(path, meshes, scale)
-    scene = replace(_gather(meshes, scale=scale, up=said_up or up), says_up=said_up is not None)
+    _refuse_far(path, objects, scale)
+    scene = _gather(objects, contents, scale=scale, up=contents.up or up)
     if not len(scene.faces):
         raise SceneError(f"{path} has only triangles without an area; export the scene again")
     return scene
 
 
-def _refuse_far(path: Path, meshes: list[Placed], scale: float) -> None:
+def _refuse_far(path: Path, objects: list[Placed], scale: float) -> None:
     """Refuse coordinates that are no building's: squares and voxels of them overflow."""
-    for name, mesh, transform in meshes:
+    for each in objects:
         with np.errstate(all="ignore"):
-            points = trimesh.transformations.transform_points(np.asarray(mesh.vertices, np.float64), transform) * scale
-            reach = np.abs(points).max(initial=0.0)
+            reach = np.abs(_points(each) * scale).max(initial=0.0)
         if not reach <= LARGEST_COORDINATE:
             raise SceneError(
-                f"{path}: the object '{name}' has a coordinate of {reach:.6g} m, beyond {LARGEST_COORDINATE:g} m; "
+                f"{path}: the object '{each.name}' has a coordinate of {reach:.6g} m, beyond {LARGEST_COORDINATE:g} m; "
                 "correct the mesh, or scene_unit in the site file"
             )
 
 
-def _collada_up(path: Path) -> str | None:
-    """Upward axis that a COLLADA file names; trimesh does not turn it."""
-    found = re.search(rb"<up_axis>\s*([XYZ])_UP\s*</up_axis>", path.read_bytes())
-    return found[1].decode().lower() if found else None
+def _points(placed: Placed) -> NDArray[np.float64]:
+    """Vertices of an object in the scene's frame."""
+    return placed.vertices @ placed.transform[:3, :3].T + placed.transform[:3, 3]
 
 
-def _load_quietly(path: Path, folder: Path) -> Any:
-    """Read with trimesh, whose readers print, log and warn about what the result shows anyway.
-
-    Parameters
-    ----------
-    folder : Path
-        The scene's; nothing outside it is read.
-    """
-    files = SceneFolder(folder, path.parent)
-    previous = logging.root.manager.disable
-    logging.disable(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
-            loaded = trimesh.load_scene(path, process=False, resolver=files)
-    except Exception as error:  # the readers raise whatever their formats make of a damaged file
-        if files.refused:
-            raise outside_error(str(path), files.refused[0]) from error
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise SceneError(f"{path} cannot be read as a mesh ({reason}); export the scene again") from error
-    finally:
-        logging.disable(previous)
-    if files.refused:
-        raise outside_error(str(path), files.refused[0])
-    return loaded
-
-
-def _placed_meshes(loaded: Any) -> list[Placed]:
-    """Triangle meshes of all nodes of a trimesh scene."""
-    meshes = []
-    for node in loaded.graph.nodes_geometry:
-        transform, name = loaded.graph[node]
-        geometry = loaded.geometry[name]
-        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            meshes.append((str(node), geometry, transform))
-    return meshes
-
-
-def _gather(meshes: list[Placed], *, scale: float, up: str) -> Scene:
+def _gather(objects: list[Placed], contents: Contents, *, scale: float, up: str) -> Scene:
     turn = UPRIGHT[up]
     vertices, faces, face_materials, face_objects = [], [], [], []
-    materials: list[str] = []
+    numbers: dict[str, int] = {}
     count = 0
-    for index, (_, mesh, transform) in enumerate(meshes):
-        points = trimesh.transformations.transform_points(np.asarray(mesh.vertices, np.float64), transform)
-        vertices.append(points @ turn.T * scale)
-        faces.append(np.asarray(mesh.faces, np.int64) + count)
-        count += len(points)
-        material = getattr(getattr(mesh.visual, "material", None), "name", None)
-        if material and material not in materials:
-            materials.append(material)
-        face_materials.append(np.full(len(mesh.faces), materials.index(material) if material else -1))
-        face_objects.append(np.full(len(mesh.faces), index))
+    for index, each in enumerate(objects):
+        vertices.append(_points(each) @ turn.T * scale)
+        # A mirrored object keeps its outside.
+        faces.append((each.faces if np.linalg.det(each.transform[:3, :3]) >= 0.0 else each.faces[:, ::-1]) + count)
+        count += len(each.vertices)
+        used = np.unique(each.face_materials[each.face_materials >= 0])
+        table = np.full(len(each.materials) + 1, -1)
+        for number in used:
+            table[number] = numbers.setdefault(each.materials[number], len(numbers))
+        face_materials.append(table[each.face_materials])
+        face_objects.append(np.full(len(each.faces), index))
     all_vertices = np.concatenate(vertices)
     all_faces = np.concatenate(faces)
     a, b, c = (all_vertices[all_faces[:, i]] for i in range(3))
@@ -222,8 +181,10 @@ def _gather(meshes: list[Placed], *, scale: float, up: str) -> Scene:
         vertices=all_vertices,
         faces=all_faces[keep].astype(np.int32),
         face_materials=np.concatenate(face_materials)[keep].astype(np.int16),
-        materials=tuple(materials),
+        materials=tuple(numbers),
         face_objects=np.concatenate(face_objects)[keep].astype(np.int32),
-        objects=tuple(name for name, _, _ in meshes),
+        objects=tuple(each.name for each in objects),
         num_degenerate=int(np.count_nonzero(~keep)),
+        says_up=contents.up is not None,
+        remarks=contents.remarks,
     )

@@ -3,8 +3,6 @@
 from pathlib import Path, PureWindowsPath
 from urllib.parse import unquote
 
-from trimesh.resolvers import Resolver
-
 from rayfix_tables.errors import SceneError
 
 
@@ -27,6 +25,14 @@ def inside(folder: Path, base: Path, name: str) -> Path | None:
     return path if path.is_relative_to(folder.resolve()) else None
 
 
+def is_file(path: Path) -> bool:
+    """Whether a path is a file; one that no file can have is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def outside_error(where: str, name: str) -> SceneError:
     """Return what to raise when a scene names a file elsewhere."""
     return SceneError(
@@ -35,44 +41,42 @@ def outside_error(where: str, name: str) -> SceneError:
     )
 
 
-class SceneFolder(Resolver):  # type: ignore[misc]
-    """Gives trimesh's readers the files of a scene's folder, and remembers what they asked for elsewhere.
-
-    Most readers go on without a file that they do not get, so that :attr:`refused` has to be looked at.
-    """
+class SceneFolder:
+    """Finds the files of a scene's folder, and remembers which it was asked for elsewhere."""
 
     def __init__(self, folder: Path, base: Path) -> None:
         self.folder = folder
         self.base = base
         self.refused: list[str] = []
 
-    def get(self, key: str) -> bytes:
-        """Content of a file."""
-        name = key.strip()
-        # A URI may have what is no letter as %20; a file may be called so.
-        for candidate in dict.fromkeys((name, unquote(name))):
-            path = inside(self.folder, self.base, candidate)
-            if path is not None and path.is_file():
-                return path.read_bytes()
-            # Exporters write where a file was on their machine; it may have come along.
-            beside = inside(self.folder, self.base, PureWindowsPath(candidate).name)
-            if path is None and beside is not None and beside.is_file():
-                return beside.read_bytes()
-            if path is None:
-                self.refused.append(name)
-                raise ValueError(f"'{name}' is not in the scene's folder")
-        raise FileNotFoundError(name)
+    def find(self, name: str) -> Path | None:
+        """Return the path of a file that the scene names, None where it is not there.
 
-    def write(self, name: str, data: str | bytes) -> None:
-        """Nothing is written beside a scene."""
-        raise NotImplementedError
+        A URI may have what is no letter as %20; a file may be called so. Exporters write where a file was on their
+        machine, perhaps with another system's separators; it may have come along.
+        """
+        name = name.strip()
+        candidates = dict.fromkeys((name, unquote(name)))
+        paths = [inside(self.folder, self.base, candidate) for candidate in candidates]
+        beside = [
+            inside(self.folder, self.base, each)
+            for candidate in candidates
+            for each in (candidate.replace("\\", "/"), PureWindowsPath(candidate).name)
+            if each
+        ]
+        for path in (*paths, *beside):
+            if path is not None and is_file(path):
+                return path
+        if None in paths:
+            self.refused.append(name)
+        return None
 
-    def namespaced(self, namespace: str) -> "SceneFolder":
-        """Return the resolver of a folder in this one."""
-        found = SceneFolder(self.folder, self.base / namespace)
-        found.refused = self.refused
-        return found
+    def refuse_outside(self, where: str) -> None:
+        """Raise when a file elsewhere was asked for.
 
-    def keys(self) -> list[str]:
-        """Names are asked for one by one."""
-        return []
+        Raises
+        ------
+        SceneError
+        """
+        if self.refused:
+            raise outside_error(where, self.refused[0])

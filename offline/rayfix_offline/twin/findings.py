@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_offline.scene.engine import FAR
 from rayfix_offline.scene.materials import ITU_MATERIALS, complex_permittivity, itu_name
 from rayfix_offline.scene.scene import METRES_PER_UNIT, Scene
 from rayfix_offline.site import SiteFile, StationSection
@@ -17,8 +18,8 @@ from rayfix_offline.twin.solids import Part, touched
 LARGE_SCENE, SMALL_SCENE = 1000.0, 1.0
 """A scene larger or smaller than this has probably another unit, m."""
 
-FAR = 10_000.0
-"""Farther from the origin than this, m, rays meet triangles, in single precision, by more than a millimetre off."""
+COARSE = 0.005
+"""A table that holds positions no finer than this, m, is not built."""
 
 MOST_NAMES = 4
 
@@ -81,11 +82,21 @@ def size_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
         )
     distance = float(np.abs(scene.bounds).max())
     if distance > FAR:
-        yield warning(
-            "origin",
-            f"the scene lies {distance / 1000.0:,.0f} km from its origin, where rays miss triangles by millimetres",
-            "move scene and stations next to the origin",
+        step = float(np.spacing(np.float32(distance)))
+        shift = ", ".join(f"{-v:.0f}" for v in np.round(scene.bounds.mean(axis=0)))
+        yield Finding(
+            severity="error" if step > COARSE else "warning",
+            kind="origin",
+            problem=f"the scene lies {distance / 1000.0:,.0f} km from its origin, where a table holds positions in "
+            f"steps of {step:.3g} m",
+            remedy=f"move scene and stations by ({shift}) m, and the answers back",
         )
+
+
+def file_findings(scene: Scene) -> Iterator[Finding]:
+    """Tell what the scene file's reader left out, or could not take as it stands."""
+    for remark in scene.remarks:
+        yield warning(remark.kind, remark.problem, remark.remedy)
 
 
 def mesh_findings(scene: Scene, repeats: Repeats, parts: Sequence[Part], enclosures: Enclosures) -> Iterator[Finding]:

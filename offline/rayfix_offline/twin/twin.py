@@ -13,6 +13,7 @@ from rayfix_offline.twin.enclosures import find_enclosures
 from rayfix_offline.twin.findings import (
     Finding,
     error,
+    file_findings,
     material_findings,
     mesh_findings,
     size_findings,
@@ -79,6 +80,7 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
         closed, free_space = sealed is not None, sealed or free_space
     findings = [
         *size_findings(site, scene),
+        *file_findings(scene),
         *mesh_findings(scene, repeats, parts, enclosures),
         *material_findings(site, scene),
         *station_findings(site, scene, parts, enclosures, touch=settings.touch),

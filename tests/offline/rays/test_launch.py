@@ -247,6 +247,8 @@ def test_a_corner_sends_rays_back(launch_in: Launch) -> None:
 class Misled:
     """An engine that takes the first triangle for hit by every ray, as single precision may at an edge."""
 
+    origin = np.zeros(3)
+
     def first_hit(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.int32]:
         """Say so."""
         return np.zeros(len(origins), np.int32)
@@ -281,3 +283,22 @@ def test_a_thin_sheet_reflects_on_both_sides(launch_in: Launch) -> None:
         np.testing.assert_allclose(segments.end[0], [1.0, 4.0], rtol=0, atol=1e-14)
         stop = points_at(segments, direction, segments.end)[0, 1]
         np.testing.assert_allclose(stop, (3 * side, 0.1, 0.2), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("shift", [(448250.0, 5412330.0, 512.0), (-3.0e6, 40.0, 0.0)])
+def test_map_coordinates_change_nothing(
+    shift: tuple[float, float, float],
+    clutter: NDArray[np.float64],
+    launch_in: Callable[..., Segments],
+    unit_vectors: Vectors,
+) -> None:
+    """A scene on map coordinates has the same mirrors and lengths, and its images where the map has them."""
+    directions, station = unit_vectors(2000, 5), np.array((3.6, 0.4, 2.6))
+    here = launch_in(clutter, station, directions)
+    there = launch_in(clutter + shift, station + shift, directions)
+    assert there.lost_ray_share == here.lost_ray_share == 0.0
+    same = (here.sequence >= 0).sum(axis=1) == (there.sequence >= 0).sum(axis=1)
+    same &= np.abs(here.end - there.end).max(axis=1) < 1e-5
+    assert same.mean() > 0.995  # the others run into an edge
+    images = there.sequences.images[there.sequence[same]] - np.asarray(shift)
+    np.testing.assert_allclose(images, here.sequences.images[here.sequence[same]], rtol=0, atol=1e-6)

@@ -220,3 +220,65 @@ def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     (tmp_path / "a.ifc").write_text("ISO-10303-21;", encoding="utf-8")
     with pytest.raises(SceneError, match=re.escape("install it with: pip install 'rayfix[ifc]'")):
         load_scene(tmp_path / "a.ifc")
+
+
+@needs_ifc
+def test_products_without_a_body_are_named(save: Callable[[Model], Path]) -> None:
+    """A wall of no height, and an opening of no height, which leaves its wall whole."""
+    model, products = room()
+    path = save(model)
+    guid = products["cabinet"].GlobalId
+    text = path.read_text()
+    solids = [products[name].Representation.Representations[0].Items[0] for name in ("cabinet",)]
+    for solid in solids:
+        text = re.sub(rf"(#{solid.id()}=IFCEXTRUDEDAREASOLID\([^)]*,)[^,)]*\)", r"\g<1>0.)", text)
+    path.write_text(text)
+    scene = load_scene(path)
+    told = [remark.problem for remark in scene.remarks]
+    assert told[0] == f"no body can be made of 1 product: cabinet ({guid})"
+    assert "ifcopenshell reports" in told[1]
+    assert len(scene.objects) == len(BODIES) - 1
+
+
+@needs_ifc
+def test_an_opening_that_cannot_be_cut_is_told_of(save: Callable[[Model], Path]) -> None:
+    model, _ = room()
+    (opening,) = model.file.by_type("IfcOpeningElement")
+    solid = opening.Representation.Representations[0].Items[0]
+    path = save(model)
+    text = re.sub(rf"(#{solid.id()}=IFCEXTRUDEDAREASOLID\([^)]*,)[^,)]*\)", r"\g<1>0.)", path.read_text())
+    path.write_text(text)
+    told = [remark.problem for remark in load_scene(path).remarks]
+    assert len(told) == 1
+    assert "bodies or openings may be missing" in told[0]
+
+
+@needs_ifc
+@pytest.mark.parametrize(
+    ("before", "behind"),
+    [(b"\xef\xbb\xbf", b""), (b"", b"\n/* made by a program; */\n"), (b"", b"\x1a"), (b"", bytes(512))],
+)
+def test_what_stands_around_a_model(before: bytes, behind: bytes, save: Callable[[Model], Path]) -> None:
+    path = save(room()[0])
+    plain = load_scene(path)
+    assert plain.remarks == ()
+    path.write_bytes(before + path.read_bytes().rstrip() + behind)
+    scene = load_scene(path)
+    assert (scene.sha256, scene.remarks) == (plain.sha256, ())
+
+
+@needs_ifc
+def test_more_behind_the_end_mark_is_told_of(save: Callable[[Model], Path]) -> None:
+    path = save(room()[0])
+    path.write_bytes(path.read_bytes() + b"#9999=IFCWALL();\n")
+    assert "behind its end mark" in load_scene(path).remarks[0].problem
+
+
+@needs_ifc
+def test_the_plain_name_of_the_newest_schema(save: Callable[[Model], Path]) -> None:
+    path = save(room("IFC4X3")[0])
+    plain = load_scene(path)
+    text, times = re.subn(r"'IFC4X3\w*'", "'IFC4X3'", path.read_text(), count=1)
+    assert times == 1
+    path.write_text(text)
+    assert load_scene(path).sha256 == plain.sha256

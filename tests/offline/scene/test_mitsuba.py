@@ -216,7 +216,7 @@ def test_a_file_that_cannot_be_read(folder: Path, content: str | bytes, expected
 def test_a_damaged_mesh(folder: Path) -> None:
     (folder / "meshes" / "box.ply").write_bytes(b"ply\nformat")
     (folder / "scene.xml").write_text(f"<scene>{shape()}</scene>")
-    with pytest.raises(SceneError, match=r"box\.ply cannot be read as a mesh"):
+    with pytest.raises(SceneError, match=r"box\.ply cannot be read as PLY"):
         load_scene(folder / "scene.xml")
 
 

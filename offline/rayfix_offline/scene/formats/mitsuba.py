@@ -6,42 +6,33 @@ bsdf whose id is like ``mat-itu_concrete``. Cameras, lights and integrators are 
 """
 
 import re
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
-from trimesh.visual.material import PBRMaterial
 
+from rayfix_offline.scene.formats.collada_transforms import rotation
+from rayfix_offline.scene.formats.ply import read_ply
+from rayfix_offline.scene.formats.xml_limits import refuse_hostile_xml
 from rayfix_offline.scene.materials import itu_name
-from rayfix_offline.scene.placed import Placed
-from rayfix_offline.scene.scene_folder import inside, outside_error
-from rayfix_offline.scene.xml_limits import refuse_hostile_xml
+from rayfix_offline.scene.placed import MOST_TRIANGLES, Contents, Placed, Remark, one_material
+from rayfix_offline.scene.scene_folder import inside, is_file, outside_error
 from rayfix_tables.errors import SceneError
-
-MOST_TRIANGLES = 20_000_000
-"""Triangles of a scene, each instance of a mesh counted; they take some 10 GB of memory."""
 
 _LARGEST = 1e9
 _LONGEST_DEFAULT = 1000
 _UNREADABLE = "export the scene again, with a Mitsuba exporter"
 
 
-def read_mitsuba(path: Path, load_mesh: Callable[[Path], Any]) -> list[Placed]:
+def read_mitsuba(path: Path) -> Contents:
     """Read the shapes of a Mitsuba scene.
-
-    Parameters
-    ----------
-    load_mesh : callable
-        Reads a mesh file as a ``trimesh.Scene``.
 
     Returns
     -------
-    list of (name, mesh, transform)
-        The mesh's material bears the name of the shape's, ``itu_concrete`` for whatever stands for it.
+    Contents
+        An object's material bears the name of the shape's, ``itu_concrete`` for whatever stands for it.
 
     Raises
     ------
@@ -64,6 +55,7 @@ def read_mitsuba(path: Path, load_mesh: Callable[[Path], Any]) -> list[Placed]:
         raise SceneError(f"{path} includes another file, which is not supported; export the scene as one file")
     materials = {element.get("id", ""): _material_name(element) for element in root.iter("bsdf")}
     placed: list[Placed] = []
+    remarks: list[Remark] = []
     num_triangles = 0
     for number, shape in enumerate(root.iter("shape"), 1):
         name = (shape.get("id") or shape.get("name") or f"shape {number}").removeprefix("mesh-")
@@ -73,16 +65,18 @@ def read_mitsuba(path: Path, load_mesh: Callable[[Path], Any]) -> list[Placed]:
             raise SceneError(f"{where} is of type '{kind}', which is not supported; export it as ply")
         transform = _to_world(shape, where)
         material = _shape_material(shape, materials, where)
-        for mesh in _meshes(path, shape, load_mesh, where):
-            if material is not None:
-                mesh.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(name=material))
-            placed.append((name, mesh, transform))
-            num_triangles += len(mesh.faces)
-            if num_triangles > MOST_TRIANGLES:
-                raise SceneError(
-                    f"{where}: the scene has more than {MOST_TRIANGLES:,} triangles up to here; leave out what is small"
-                )
-    return placed
+        mesh, told = _mesh(path, shape, where)
+        materials_of, face_materials = one_material(material, len(mesh.faces))
+        placed.append(
+            replace(mesh, name=name, materials=materials_of, face_materials=face_materials, transform=transform)
+        )
+        remarks += [replace(each, problem=f"shape '{name}': {each.problem}") for each in told]
+        num_triangles += len(mesh.faces)
+        if num_triangles > MOST_TRIANGLES:
+            raise SceneError(
+                f"{where}: the scene has more than {MOST_TRIANGLES:,} triangles up to here; leave out what is small"
+            )
+    return Contents(objects=tuple(placed), remarks=tuple(remarks))
 
 
 def _parse(path: Path) -> ElementTree.Element:
@@ -138,8 +132,8 @@ def _shape_material(shape: ElementTree.Element, materials: dict[str, str | None]
     return None
 
 
-def _meshes(path: Path, shape: ElementTree.Element, load_mesh: Callable[[Path], Any], where: str) -> list[Any]:
-    """Triangle meshes of a shape's file."""
+def _mesh(path: Path, shape: ElementTree.Element, where: str) -> tuple[Placed, tuple[Remark, ...]]:
+    """Triangles of a shape's file, and what there is to say about it."""
     element = shape.find("string[@name='filename']")
     if element is None or not element.get("value"):
         raise SceneError(f'{where} names no file; add <string name="filename" value="....ply"/>')
@@ -147,17 +141,13 @@ def _meshes(path: Path, shape: ElementTree.Element, load_mesh: Callable[[Path], 
     file = inside(path.parent, path.parent, name)
     if file is None:
         raise outside_error(where, name)
-    try:
-        found = file.is_file()
-    except OSError:
-        found = False
-    if not found:
+    if not is_file(file):
         raise SceneError(f"{where} needs {name}, which is not there; put it beside the scene file")
-    loaded = load_mesh(file)
-    meshes = [mesh for mesh in loaded.geometry.values() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
-    if not meshes:
+    contents = read_ply(file)
+    mesh = contents.objects[0]
+    if not len(mesh.faces):
         raise SceneError(f"{where}: {name} holds no triangles; export it as a triangle mesh")
-    return meshes
+    return mesh, contents.remarks
 
 
 def _to_world(shape: ElementTree.Element, where: str) -> NDArray[np.float64]:
@@ -188,7 +178,7 @@ def _operation(element: ElementTree.Element, where: str) -> NDArray[np.float64]:
         if not length > 0.0:
             raise SceneError(f"{where} is rotated about no axis; give x, y or z a value in <rotate>")
         angle = np.deg2rad(_numbers(element.get("angle", ""), where, (1,))[0])
-        out = np.asarray(trimesh.transformations.rotation_matrix(angle, axis / length))
+        out = rotation(axis, float(angle))
     elif element.tag == "matrix":
         values = _numbers(element.get("value", ""), where, (9, 16))
         size = 3 if len(values) == 9 else 4

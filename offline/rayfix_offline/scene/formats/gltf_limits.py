@@ -1,10 +1,10 @@
 """Limits of glTF files' nodes, checked before a reader follows them."""
 
+import codecs
 import json
 from pathlib import Path
-from typing import Any
 
-from rayfix_offline.scene.xml_limits import MOST_NESTED
+from rayfix_offline.scene.formats.xml_limits import MOST_NESTED
 from rayfix_tables.errors import SceneError
 
 _JSON_CHUNK = b"JSON"
@@ -21,7 +21,7 @@ def refuse_hostile_gltf(path: Path, content: bytes) -> None:
         When the nodes are no trees, or more than 200 deep.
     """
     try:
-        nodes = json.loads(_json_of(content))["nodes"]
+        nodes = json.loads(json_of(content))["nodes"]
         children = [[int(child) for child in node.get("children", ())] for node in nodes]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return
@@ -49,10 +49,16 @@ def refuse_hostile_gltf(path: Path, content: bytes) -> None:
         raise SceneError(f"{path} has nodes that lie in each other in a circle; export the scene again, as trees")
 
 
-def _json_of(content: bytes) -> Any:
-    """JSON of a file, which in a binary one is the first chunk."""
+def json_of(content: bytes) -> bytes:
+    """Return the JSON of a file, which in a binary one is the first chunk.
+
+    Raises
+    ------
+    ValueError
+        When the first chunk is something else.
+    """
     if content[:4] != b"glTF":
-        return content
+        return content.removeprefix(codecs.BOM_UTF8)
     if content[16:20] != _JSON_CHUNK:
         raise ValueError("the first chunk is not JSON")
     return content[20 : 20 + int.from_bytes(content[12:16], "little")]

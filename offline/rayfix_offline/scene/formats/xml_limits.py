@@ -77,10 +77,10 @@ def refuse_hostile_collada(path: Path, content: bytes) -> None:
 def _refuse_infinite(path: Path, root: ElementTree.Element) -> None:
     # The reader takes NaN for 0, and leaves out triangles whose corners are infinite in single precision. Only
     # positions count: exporters write normals of NaN.
-    inputs = [element for element in root.iter() if _kind(element) == "input"]
+    inputs = [element for element in root.iter() if kind_of(element) == "input"]
     positions = {each.get("source", "")[1:] for each in inputs if each.get("semantic") == "POSITION"}
-    sources = [element for element in root.iter() if _kind(element) == "source" and element.get("id") in positions]
-    for element in (child for source in sources for child in source if _kind(child) == "float_array"):
+    sources = [element for element in root.iter() if kind_of(element) == "source" and element.get("id") in positions]
+    for element in (child for source in sources for child in source if kind_of(child) == "float_array"):
         words = (element.text or "").split()
         try:
             numbers = np.array(words, np.float64)
@@ -97,16 +97,16 @@ def _refuse_infinite(path: Path, root: ElementTree.Element) -> None:
 def _refuse_multiplied(path: Path, root: ElementTree.Element, limit: int) -> None:
     nodes, sizes = {}, {}
     for element in root.iter():
-        kind, name = _kind(element), element.get("id")
+        kind, name = kind_of(element), element.get("id")
         if kind == "node" and name:
             nodes[name] = element
         elif kind == "geometry" and name:
-            sizes[name] = sum(len(each.text or "") for each in element.iter() if _kind(each) == "p")
+            sizes[name] = sum(len(each.text or "") for each in element.iter() if kind_of(each) == "p")
     known: dict[str, tuple[int, int]] = {}
 
     def measure(element: ElementTree.Element, depth: int) -> tuple[int, int]:
         """Give the characters that an element comes to, and how deep its instances nest."""
-        name = element.get("id", "") if _kind(element) == "node" else ""
+        name = element.get("id", "") if kind_of(element) == "node" else ""
         if name in known:
             return known[name]
         if depth > MOST_NESTED:
@@ -116,7 +116,7 @@ def _refuse_multiplied(path: Path, root: ElementTree.Element, limit: int) -> Non
             )
         size, height = 0, 0
         for child in element:
-            kind, target = _kind(child), child.get("url", "").removeprefix("#")
+            kind, target = kind_of(child), child.get("url", "").removeprefix("#")
             if kind == "node":
                 inner = measure(child, depth + 1)
             elif kind == "instance_node" and target in nodes:
@@ -141,10 +141,10 @@ def _refuse_multiplied(path: Path, root: ElementTree.Element, limit: int) -> Non
         return size, height
 
     for element in root.iter():
-        if _kind(element) == "visual_scene":
+        if kind_of(element) == "visual_scene":
             measure(element, 0)
 
 
-def _kind(element: ElementTree.Element) -> str:
-    """Tag without its namespace."""
+def kind_of(element: ElementTree.Element) -> str:
+    """Return the tag of an element without its namespace."""
     return element.tag.rpartition("}")[2]

@@ -1,0 +1,1 @@
+"""Scene files of all kinds, each read into objects with their places."""
