@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: client viewer browser screenshots demo lock test test-portable lint types package images accuracy openapi clean
+.PHONY: client viewer viewer-test browser screenshots demo lock test test-portable lint types package images accuracy openapi clean
 
 # pip takes what builds the package from these too: under the first name until 25.2, under the second from 25.3 on.
 PINNED := PIP_CONSTRAINT=$(CURDIR)/constraints.txt PIP_BUILD_CONSTRAINT=$(CURDIR)/constraints.txt
@@ -27,6 +27,14 @@ $(VIEWER): $(wildcard $(FRONTEND)/*.*) $(shell find $(FRONTEND)/src -type f)
 		cd $(FRONTEND) && npm ci --no-progress && npm run build; \
 	else \
 		echo "the viewer is not built: it needs npm and Node.js 20.19 or later"; \
+	fi
+
+# The viewer's own tests of its numerics by vitest, and its types and rules by tsc and eslint.
+viewer-test:
+	@if $(CAN_BUILD_VIEWER); then \
+		cd $(FRONTEND) && npm ci --no-progress && npm run lint && npm test; \
+	else \
+		echo "the viewer's own tests are left out: they need npm and Node.js 20.19 or later"; \
 	fi
 
 # The documentation's pictures, of the demo's table.

@@ -12,7 +12,10 @@ export function h<K extends keyof HTMLElementTagNameMap>(
     if (value === undefined || value === null || value === false) continue;
     if (name.startsWith("on")) element.addEventListener(name.slice(2), value as EventListener);
     else if (name in element && !name.startsWith("aria")) Object.assign(element, { [name]: value });
-    else element.setAttribute(name, value === true ? "" : String(value));
+    else {
+      const text = value as string | number | true;
+      element.setAttribute(name, text === true ? "" : String(text));
+    }
   }
   element.append(...children.filter((c): c is Node | string => c !== null && c !== undefined && c !== false));
   return element;

@@ -6,7 +6,7 @@ export const DATA_ELEMENT = "rayfix-data";
 
 export function embeddedData(): EmbeddedData | null {
   const element = document.getElementById(DATA_ELEMENT);
-  return element === null ? null : (JSON.parse(element.textContent!) as EmbeddedData);
+  return element === null ? null : (JSON.parse(element.textContent) as EmbeddedData);
 }
 
 export function decodeBase64(text: string): ArrayBuffer {

@@ -94,7 +94,7 @@ function heardBy(station: StationInfo, measurements: Measurement[], north: numbe
 
 /** Length that a time measurement tells, m; null for what is no length. */
 function lengthOf(m: Measurement): LengthForm | null {
-  const number = (key: string): number | null => (typeof m[key] === "number" ? (m[key] as number) : null);
+  const number = (key: string): number | null => (typeof m[key] === "number" ? m[key] : null);
   const stdev = number("stdev_m") ?? (number("stdev_ns") ?? 0) * METRES_PER_NANOSECOND;
   const metres = number("range_m") ?? number("range_difference_m");
   if (metres !== null) return { value: metres, stdev };

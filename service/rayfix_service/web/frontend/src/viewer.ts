@@ -252,7 +252,7 @@ export class Viewer {
     try {
       report = JSON.parse(text) as Report;
     } catch (error) {
-      throw new Error(`This is not JSON: ${(error as Error).message}`);
+      throw new Error(`This is not JSON: ${(error as Error).message}`, { cause: error });
     }
     const fix = await this.api!.locate(report);
     this.show("fixes");
@@ -324,17 +324,20 @@ export class Viewer {
     const over = (on: boolean): void => void stage.classList.toggle("dropping", on && this.api !== null);
     stage.addEventListener("dragover", (e) => (e.preventDefault(), over(true)));
     stage.addEventListener("dragleave", () => over(false));
-    stage.addEventListener("drop", async (e) => {
+    stage.addEventListener("drop", (e) => {
       e.preventDefault();
       over(false);
-      if (this.api === null) return;
-      const text = (await e.dataTransfer?.files[0]?.text()) ?? e.dataTransfer?.getData("text");
-      if (!text) return;
-      try {
-        await this.locate(text);
-      } catch (error) {
-        this.notices.show((error as Error).message, "error");
-      }
+      if (this.api !== null) void this.locateDropped(e.dataTransfer);
     });
+  }
+
+  private async locateDropped(data: DataTransfer | null): Promise<void> {
+    const text = (await data?.files[0]?.text()) ?? data?.getData("text");
+    if (!text) return;
+    try {
+      await this.locate(text);
+    } catch (error) {
+      this.notices.show((error as Error).message, "error");
+    }
   }
 }
