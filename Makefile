@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: client viewer viewer-test browser screenshots demo lock test test-portable lint types package images accuracy openapi clean
+.PHONY: client coverage viewer viewer-test browser screenshots demo lock test test-portable lint types package images accuracy openapi clean
 
 # pip takes what builds the package from these too: under the first name until 25.2, under the second from 25.3 on.
 PINNED := PIP_CONSTRAINT=$(CURDIR)/constraints.txt PIP_BUILD_CONSTRAINT=$(CURDIR)/constraints.txt
@@ -50,6 +50,15 @@ test: $(VENV)/.done
 # The numerical tests with the kernels of older processors, on one thread and on two: nothing depends on this one's rounding.
 test-portable: $(VENV)/.done
 	$(BIN)/python tests/portable.py
+
+# What the quick tests run of the code; compiled kernels are seen by the tests of their twins alone, without the compiler.
+KERNEL_TESTS := tests/service/fusion/test_kernels.py tests/service/fusion/posterior tests/offline/fit tests/tables/gaussians
+
+coverage: $(VENV)/.done
+	$(BIN)/coverage run --parallel-mode -m pytest -m "not slow" --ignore tests/browser
+	NUMBA_DISABLE_JIT=1 $(BIN)/coverage run --parallel-mode -m pytest -m "not slow" -W ignore::RuntimeWarning $(KERNEL_TESTS)
+	$(BIN)/coverage combine
+	$(BIN)/coverage report
 
 # In a real browser; what it showed is kept in browser-artefacts/.
 browser: $(VENV)/.done viewer

@@ -91,7 +91,7 @@ def make_alternatives(
     """
     offsets = np.zeros(len(parts) + 1, np.int64)
     for p in range(len(parts)):
-        offsets[p + 1] = offsets[p] + parts[p].stop - parts[p].begin
+        offsets[p + 1] = offsets[p] + parts[p]["stop"] - parts[p]["begin"]
     logs, scores = np.empty(offsets[-1]), np.empty(offsets[-1])
     tops = np.empty(len(parts))
     for p in range(len(parts)):
@@ -111,17 +111,17 @@ def make_alternatives(
             break
         part = parts[p]
         keep = np.flatnonzero(scores[offsets[p] : offsets[p + 1]] > top + log_floor)
-        own_log, own_mean, own_cov = logs[offsets[p] + keep], mean[part.begin + keep], cov[part.begin + keep]
-        if part.length_variance < np.inf:
-            condition_on_length(own_mean, own_cov, part.length, part.length_variance)
+        own_log, own_mean, own_cov = logs[offsets[p] + keep], mean[part["begin"] + keep], cov[part["begin"] + keep]
+        if part["length_variance"] < np.inf:
+            condition_on_length(own_mean, own_cov, part["length"], part["length_variance"])
         # The divergence of all parts together is what counts, though a part may turn out to be the right one.
         allowed = max_divergence * np.exp(min(top - tops[p], RELAXED))
         left = merge_gaussians(own_log, own_mean, own_cov, NO_NOISE, allowed)
-        own_readings = readings[part.first_reading : part.last_reading]
+        own_readings = readings[part["first_reading"] : part["last_reading"]]
         out = slice(done, done + len(left))
         to_columns(own_log[left], own_mean[left], own_cov[left], own_readings, dimension, columns[:, out])
-        outlier[out] = part.outlier
-        value[out] = own_log[left] + part.log_clocks
+        outlier[out] = part["outlier"]
+        value[out] = own_log[left] + part["log_clocks"]
         done = out.stop
         if done > most:
             best = np.sort(np.argsort(-value[:done], kind="mergesort")[:most])
@@ -157,17 +157,17 @@ def weigh(
     """
     highest = -np.inf
     for n in range(len(out_log)):
-        k = part.begin + n
-        log = log_evidence[k] + part.log_weight
+        k = part["begin"] + n
+        log = log_evidence[k] + part["log_weight"]
         z, variance = mean[k, 2], cov[k, 2, 2]
-        if part.length_variance < np.inf:
-            total = cov[k, 3, 3] + part.length_variance
-            apart = part.length - mean[k, 3]
+        if part["length_variance"] < np.inf:
+            total = cov[k, 3, 3] + part["length_variance"]
+            apart = part["length"] - mean[k, 3]
             log -= 0.5 * (apart * apart / total + np.log(total) + LOG_2PI)
             z += cov[k, 2, 3] * apart / total
             variance -= cov[k, 2, 3] * cov[k, 2, 3] / total
         out_log[n] = log
-        out_score[n] = log + part.log_clocks + height_gain(z, variance, precision, eta)
+        out_score[n] = log + part["log_clocks"] + height_gain(z, variance, precision, eta)
         highest = max(highest, out_score[n])
     return highest
 
@@ -248,14 +248,15 @@ def to_columns(log_evidence: Any, mean: Any, cov: Any, readings: Any, dimension:
         for n in range(count):
             full[-1, n] -= 0.5 * full[first + a, n] * mean[n, i]
     for reading in readings:
-        c, weight = 3 + reading.clock, 1.0 / reading.variance
+        c, weight = 3 + reading["clock"], 1.0 / reading["variance"]
         for n in range(count):
             full[triangle(c) + c, n] += weight
             full[triangle(dimension) + c, n] += weight
             full[triangle(dimension) + dimension, n] += weight
-            full[first + c, n] += weight * reading.offset
-            full[first + dimension, n] += weight * reading.offset
-            full[-1, n] -= 0.5 * (weight * reading.offset * reading.offset + np.log(reading.variance) + LOG_2PI)
+            full[first + c, n] += weight * reading["offset"]
+            full[first + dimension, n] += weight * reading["offset"]
+            square = weight * reading["offset"] * reading["offset"]
+            full[-1, n] -= 0.5 * (square + np.log(reading["variance"]) + LOG_2PI)
     if len(readings):
         pivot = np.ones(count)
         integrate_last(full, dimension + 1, 0.0, pivot, det)
