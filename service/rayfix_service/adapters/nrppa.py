@@ -23,8 +23,8 @@ from rayfix_service.adapters.nrppa_documents import (
     UlAoa,
     UlRtoa,
     Zoa,
+    unwrapped,
 )
-from rayfix_service.adapters.nrppa_pdu import unwrapped
 from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_interval, time_interval
 from rayfix_service.fusion.measurements.directions import to_scene
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, TimeOfArrival
