@@ -154,8 +154,8 @@ def read_site(path: str | Path) -> SiteFile:
     """
     path = Path(path)
     try:
-        # Some editors write a byte order mark.
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        # Some editors write a byte order mark first.
+        document = tomllib.loads(path.read_text(encoding="utf-8").removeprefix("\ufeff"))
     except FileNotFoundError:
         raise SiteError(f"there is no site file at {path}; 'rayfix example DIR' writes one to start from") from None
     except OSError as error:
