@@ -1,11 +1,12 @@
 """The site file: what to build, where the stations are, how waves travel there."""
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from rayfix_tables.errors import SiteError
 from rayfix_tables.site import SiteInfo, Station, StationBias
@@ -15,6 +16,8 @@ LEAST_WINDOW_RATIO = 1.5
 
 LARGEST_COORDINATE = 5e7
 """m; maps have coordinates of up to 2e7 m, and single precision tells no walls apart far beyond."""
+
+WINDOWS_PATH = "write Windows paths with / or in single quotes; in double quotes, \\ begins an escape sequence"
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Coordinate = Annotated[float, Field(ge=-LARGEST_COORDINATE, le=LARGEST_COORDINATE)]
@@ -33,6 +36,13 @@ class SiteSection(_Section):
     scene_unit: Literal["m", "cm", "mm", "in", "ft"] = "m"
     scene_up: Literal["z", "y"] = "z"
     north_deg: Annotated[float, Field(ge=-360, le=360)] = 90.0
+
+    @field_validator("scene")
+    @classmethod
+    def _no_escapes(cls, scene: str) -> str:
+        if any(ord(letter) < 32 for letter in scene):  # "C:\temp\new.glb" has a tab and a new line
+            raise ValueError(f"{scene!r} is no file name: {WINDOWS_PATH}")
+        return scene
 
 
 class PropagationSection(_Section):
@@ -144,7 +154,8 @@ def read_site(path: str | Path) -> SiteFile:
     """
     path = Path(path)
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        # Some editors write a byte order mark first.
+        document = tomllib.loads(path.read_text(encoding="utf-8").removeprefix("\ufeff"))
     except FileNotFoundError:
         raise SiteError(f"there is no site file at {path}; 'rayfix example DIR' writes one to start from") from None
     except OSError as error:
@@ -152,8 +163,15 @@ def read_site(path: str | Path) -> SiteFile:
     except UnicodeDecodeError as error:
         raise SiteError(f"{path} is no text in UTF-8; give a TOML site file") from error
     except tomllib.TOMLDecodeError as error:
-        raise SiteError(f"{path} is not valid TOML: {error}") from error
+        raise SiteError(f"{path} is not valid TOML: {error}{_hint(error)}") from error
     return parse_site(document, source=str(path))
+
+
+def _hint(error: tomllib.TOMLDecodeError) -> str:
+    """Say what a Windows path in TOML wants, where the error is that of one in double quotes."""
+    if re.search(r"escape|hex value", str(error), re.IGNORECASE) is None:
+        return ""
+    return f"; {WINDOWS_PATH}"
 
 
 def parse_site(document: dict[str, Any], *, source: str = "site") -> SiteFile:

@@ -243,3 +243,20 @@ def test_problems_of_a_file_name_it(tmp_path: Path) -> None:
     path = tmp_path / "site.toml"
     path.write_text('[site]\nname = "a"\nscene = "a.glb"\n')
     assert file_refused(path) == f"{path}: stations is missing: add a section [[stations]]"
+
+
+def test_a_byte_order_mark(tmp_path: Path) -> None:
+    text = '[site]\nname = "a"\nscene = "b.glb"\n[[stations]]\nid = "s"\nposition_m = [1, 2, 3]\n'
+    (tmp_path / "plain.toml").write_text(text)
+    (tmp_path / "marked.toml").write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert read_site(tmp_path / "marked.toml") == read_site(tmp_path / "plain.toml")
+
+
+@pytest.mark.parametrize("name", [r"C:\Users\me\hall.glb", r"data\hall.glb", r"C:\temp\new.glb"])
+def test_windows_paths(name: str, tmp_path: Path) -> None:
+    """An escape sequence that TOML does not have, one that it lacks digits of, and two that it has."""
+    text = '[site]\nname = "a"\nscene = {}\n[[stations]]\nid = "s"\nposition_m = [1, 2, 3]\n'
+    (tmp_path / "site.toml").write_text(text.format(f'"{name}"'))
+    assert "write Windows paths with / or in single quotes" in file_refused(tmp_path / "site.toml")
+    (tmp_path / "site.toml").write_text(text.format(f"'{name}'"))
+    assert read_site(tmp_path / "site.toml").site.scene == name

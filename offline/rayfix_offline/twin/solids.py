@@ -34,7 +34,7 @@ class Part:
     manifold : bool
         No edge belongs to more than two triangles.
     volume : float, m3
-        Signed: positive where the triangles face outwards.
+        Signed: positive where the triangles face outwards, or most of them where they face different ways.
     middle : tuple of float, m
         Mean of its triangles' centres.
     """
@@ -73,7 +73,11 @@ def split_parts(mesh: Mesh) -> tuple[Part, ...]:
     sizes = total(np.ones(len(label)))
     middle = np.stack([total(m) for m in scene.triangles.mean(axis=1).T], axis=1) / sizes[:, None]
     a, b, c = (scene.triangles[:, i] - middle[label] for i in range(3))
-    volume = total(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
+    shares = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
+    if (balance != 0).any():
+        # Triangles of a part that face different ways would cancel each other.
+        shares = np.where(topology.turned(label), -shares, shares)
+    volume = total(shares)
     faces = np.split(np.argsort(label, kind="stable"), np.cumsum(sizes.astype(np.int64))[:-1])
     open_sides = total((uses % 2 == 1).sum(axis=1))
     crowded_sides = total((uses > 2).sum(axis=1))

@@ -62,6 +62,43 @@ class Topology:
         label = connect(np.concatenate([at[:, [0, 1]], at[:, [1, 2]]]), len(nodes))
         return np.asarray(label[at[:, 0]])
 
+    def turned(self, groups: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Say which triangles to turn so that neighbours face the same way.
+
+        Only neighbours count that share an edge which no third triangle of their group has. Of what hangs together so,
+        the smaller number is turned. What cannot be turned to agree, as a Moebius strip, stays.
+
+        Parameters
+        ----------
+        groups : ndarray of int, shape (n_faces,)
+
+        Returns
+        -------
+        ndarray of bool, shape (n_faces,)
+        """
+        count = len(groups)
+        keys = (self.edges * (int(groups.max(initial=0)) + 1) + np.asarray(groups, np.int64)[:, None]).reshape(-1)
+        _, inverse, uses = np.unique(keys, return_inverse=True, return_counts=True)
+        order = np.argsort(inverse.reshape(-1), kind="stable")
+        order = order[uses[inverse.reshape(-1)[order]] == 2]
+        first, second = order[0::2], order[1::2]
+        forward = (self.points < np.roll(self.points, -1, axis=1)).reshape(-1)
+        # Each triangle is there twice, as drawn and turned; neighbours that run through their edge in the same
+        # direction agree where one of them is turned.
+        other = np.where(forward[first] == forward[second], count, 0)
+        one, two = first // 3, second // 3
+        links = np.concatenate(
+            [np.stack([one, two + other], axis=1), np.stack([one + count, two + count - other], axis=1)]
+        )
+        label = connect(links, 2 * count)
+        drawn, mirrored = label[:count], label[count:]
+        # A part and its mirror image are two components of one name, the lesser of their labels.
+        name = np.minimum(drawn, mirrored)
+        turned = drawn > name
+        size = np.bincount(name, minlength=2 * count)
+        most = np.bincount(name, weights=turned, minlength=2 * count) * 2 > size
+        return np.asarray(np.where(drawn == mirrored, False, turned ^ most[name]))
+
     def uses_within(self, groups: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Count how triangles of a group use the edges.
 

@@ -67,6 +67,7 @@ def check(
     *,
     what: str,
     check_counts: Callable[[Mapping[str, Any]], None] | None = None,
+    unwrap: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
 ) -> M:
     """Validate a message; how much it holds is looked at first.
 
@@ -80,6 +81,8 @@ def check(
         What the message is called in errors about the whole of it.
     check_counts : callable, optional
         Raises InvalidReportError when a message, which need not be valid, has too much of something.
+    unwrap : callable, optional
+        Takes the message out of what it is sent in.
 
     Raises
     ------
@@ -92,7 +95,7 @@ def check(
         raise too_much((), f"{what} has more than {MAX_MESSAGE_VALUES} values; leave out what is not read")
     data = read_json(message) if isinstance(message, bytes) else message
     if isinstance(data, Mapping):
-        data = dict(data)
+        data = dict(unwrap(data) if unwrap is not None else data)
         stations = data.get("stations")
         if isinstance(stations, Mapping) and len(stations) > MAX_STATIONS:
             raise too_much(("stations",), f"stations has {len(stations)} names; give at most {MAX_STATIONS}")

@@ -23,6 +23,7 @@ from rayfix_service.adapters.nrppa_documents import (
     UlAoa,
     UlRtoa,
     Zoa,
+    unwrapped,
 )
 from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_interval, time_interval
 from rayfix_service.fusion.measurements.directions import to_scene
@@ -62,7 +63,7 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
     Parameters
     ----------
     message : Mapping or bytes
-        The message as :class:`NrppaDocument` describes it, or its JSON text.
+        The message as :class:`NrppaDocument` describes it, or the whole PDU with it, or the JSON text of either.
     stations : Mapping, optional
         Stations by TRP-ID (as text), for those that the message's own map does not have. A TRP-ID in neither is
         itself a station's identifier.
@@ -74,7 +75,7 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
     InvalidReportError
         For a message that is not valid, or of which no measurement can be used.
     """
-    document = check(NrppaDocument, message, what="the NRPPa message", check_counts=_check_counts)
+    document = check(NrppaDocument, message, what="the NRPPa message", check_counts=_check_counts, unwrap=unwrapped)
     name = _LISTS[0] if document.response else _LISTS[1]
     ranges_to: dict[int, list[UeRxTx]] = {}
     for ue in document.ue_rx_tx:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rayfix_service.adapters.adapted import Adapted, adapted_report, station_of
+from rayfix_service.adapters.adapted import Adapted, Skipped, adapted_report, station_of
 from rayfix_service.adapters.transmissions import Joiner, Transmission
 from rayfix_service.fusion.measurements.report import Angle
 from rayfix_service.wire import MAX_REPORTS, FieldProblem, InvalidReportError
@@ -120,7 +120,8 @@ def parse_ublox(
     """Turn the lines of several anchors into reports, one for each transmission of each tag.
 
     Lines with one sequence number belong together. Where there is none, an anchor that tells of a tag again begins
-    that tag's next report: anchors' clocks differ. Lines that begin otherwise than ``+UUDF:`` are passed over.
+    that tag's next report: anchors' clocks differ. In a line, what stands before ``+UUDF:`` is passed over, such as a
+    log's time. Lines without it are passed over too, and counted in what the first report skips.
 
     Parameters
     ----------
@@ -140,11 +141,15 @@ def parse_ublox(
         text = text.decode("utf-8", errors="replace")
     joiner: Joiner[tuple[int, UudfEvent]] = Joiner(window=math.inf)
     joined: list[Transmission[tuple[int, UudfEvent]]] = []
+    others: list[int] = []
     for number, line in enumerate(text.splitlines()):
-        if not line.strip().startswith(_PREFIX):
+        place = line.find(_PREFIX)
+        if place < 0:
+            if line.strip():
+                others.append(number)
             continue
         try:
-            event = parse_uudf(line)
+            event = parse_uudf(line[place:])
         except InvalidReportError as error:
             message = f"line {number + 1} {str(error).removeprefix('the line ')}"
             raise InvalidReportError((FieldProblem(path=("lines", number), message=message),)) from None
@@ -154,16 +159,26 @@ def parse_ublox(
             raise InvalidReportError((FieldProblem(path=(), message=text),))
     joined += joiner.flush()
     if not joined:
-        raise InvalidReportError((FieldProblem(path=(), message=f"no line begins with {_PREFIX}; give at least one"),))
+        raise InvalidReportError((FieldProblem(path=(), message=f"no line holds {_PREFIX}; give at least one"),))
     joined.sort(key=lambda transmission: min(number for number, _ in transmission.heard.values()))
-    reports = []
+    reports: list[Adapted] = []
     for transmission in joined:
         angles: list[tuple[Path, Angle]] = [
             (("lines", number), ublox_angle(event, station_of(event.anchor, stations), stdev_deg=stdev_deg))
             for number, event in transmission.heard.values()
         ]
-        reports.append(adapted_report(list(angles), [], target_id=transmission.target, timestamp=None))
+        skipped = [] if reports else _passed_over(others)
+        reports.append(adapted_report(list(angles), skipped, target_id=transmission.target, timestamp=None))
     return tuple(reports)
+
+
+def _passed_over(lines: list[int]) -> list[Skipped]:
+    """Tell of the lines that hold no event, at the first of them."""
+    if not lines:
+        return []
+    more = len(lines) - 1
+    others = f" and {more} more {'line holds' if more == 1 else 'lines hold'}" if more else " holds"
+    return [Skipped(path=("lines", lines[0]), reason=f"this line{others} no {_PREFIX}")]
 
 
 def _invalid(text: str) -> InvalidReportError:

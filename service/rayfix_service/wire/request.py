@@ -1,5 +1,6 @@
 """From the JSON of a report to the report."""
 
+import codecs
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,7 +24,7 @@ _SHORT = 16 << 10
 
 
 def read_json(body: bytes) -> object:
-    """Parse a JSON text.
+    """Parse a JSON text; a byte order mark before it, as some editors write one, is passed over.
 
     The literals NaN and Infinity and numbers like 1e400 become floats that are not finite: the model then
     refuses them at their place, which helps more than "malformed" would.
@@ -33,6 +34,7 @@ def read_json(body: bytes) -> object:
     MalformedJsonError
         For bytes that are not JSON.
     """
+    body = body.removeprefix(codecs.BOM_UTF8)
     if not body.strip():
         raise MalformedJsonError('the document is empty; give a JSON object, e.g. {"measurements": [...]}')
     try:
@@ -59,6 +61,7 @@ def parse_report(document: Mapping[str, Any] | bytes, *, most_problems: int = MA
         For a document that is not a valid report, or a text of more values than a report can have.
     """
     if isinstance(document, bytes):
+        document = document.removeprefix(codecs.BOM_UTF8)
         model = _validate_text(document, most_problems)
     else:
         model = _validate(document, most_problems)

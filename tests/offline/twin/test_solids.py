@@ -337,3 +337,49 @@ def test_vertices_that_are_shared_or_not_make_no_difference(room: NDArray[np.flo
     (one,), (other,) = parts_of(soup), parts_of(shared)
     assert (one.closed, one.consistent) == (other.closed, other.consistent) == (True, True)
     assert one.volume == pytest.approx(other.volume, rel=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_half_of_the_triangles_turned_is_no_loss_of_volume(seed: int, room: NDArray[np.float64]) -> None:
+    """A room and a sphere, in which any triangles face either way: volumes as large as when none is turned."""
+    rng = np.random.default_rng(seed)
+    ball = (*np.asarray(trimesh.creation.icosphere(subdivisions=2, radius=0.4).triangles), 2.0, 2.5, 1.0)
+    for name, triangles in (("room", room), ("ball", ball)):
+        (plain,) = parts_of(scene_of(**{name: triangles}))
+        mixed = triangles.copy()
+        which = rng.permutation(len(mixed))[: len(mixed) // 2]
+        mixed[which] = mixed[which, ::-1]
+        (part,) = parts_of(scene_of(**{name: mixed}))
+        assert (part.closed, part.consistent) == (True, False)
+        assert abs(part.volume) == pytest.approx(abs(plain.volume), rel=1e-12)
+
+
+def test_most_triangles_tell_how_a_part_faces(room: NDArray[np.float64]) -> None:
+    for turned, sign in (([0, 1, 2], 1.0), (list(range(9)), -1.0)):
+        mixed = room.copy()
+        mixed[turned] = mixed[turned, ::-1]
+        (part,) = parts_of(scene_of(room=mixed))
+        (plain,) = parts_of(scene_of(room=room))
+        assert part.volume == pytest.approx(sign * plain.volume, rel=1e-12)
+
+
+def test_a_room_of_mixed_triangles_still_encloses(clutter: NDArray[np.float64]) -> None:
+    mixed = clutter[:12].copy()
+    mixed[::2] = mixed[::2, ::-1]
+    found, _ = enclosures(scene_of(room=mixed, cabinet=clutter[12:24], table=clutter[24:]), *STATIONS)
+    assert found == {"room": True, "cabinet": False, "table": False}
+
+
+def test_a_strip_that_cannot_be_turned_to_agree_stays() -> None:
+    """A Moebius strip of 8 quadrilaterals: it is open, and nothing is said of its volume."""
+    angle = np.arange(9) * 2.0 * np.pi / 8.0
+    half = 0.4 * np.stack(
+        [np.cos(angle / 2) * np.cos(angle), np.cos(angle / 2) * np.sin(angle), np.sin(angle / 2)], axis=1
+    )
+    middle = np.stack([np.cos(angle), np.sin(angle), np.zeros(9)], axis=1)
+    one, other = middle + half, middle - half
+    strip = np.array(
+        [t for k in range(8) for t in ((one[k], other[k], one[k + 1]), (other[k], other[k + 1], one[k + 1]))]
+    )
+    (part,) = parts_of(scene_of(strip=strip))
+    assert (part.closed, part.consistent) == (False, False)

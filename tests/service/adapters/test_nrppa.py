@@ -1,6 +1,7 @@
 """NRPPa measurements by hand: angles, arrivals, round trips, qualities, and every refusal."""
 
 import copy
+import json
 import math
 from typing import Any
 
@@ -383,3 +384,49 @@ def test_too_many_measurements_are_refused():
     }
     with pytest.raises(InvalidReportError, match="400 measurements; give at most 256"):
         parse_nrppa(document)
+
+
+def pdu(
+    content: dict[str, Any], *, outcome: str = "successfulOutcome", name: str = "MeasurementResponse"
+) -> dict[str, Any]:
+    """Wrap the lists of a message into a PDU, among elements that are not read."""
+    elements = [{"id": 41, "criticality": "reject", "value": {"LMF-Measurement-ID": 1}}]
+    elements += [{"id": 43, "criticality": "reject", "value": {key: value}} for key, value in content.items()]
+    elements.append({"id": 7, "criticality": "ignore", "value": {"CriticalityDiagnostics": {}}})
+    inner = {name: {"protocolIEs": elements}}
+    return {outcome: {"procedureCode": 14, "criticality": "reject", "nrppatransactionID": 9, "value": inner}}
+
+
+@pytest.mark.parametrize(
+    ("outcome", "name", "key"),
+    [
+        ("successfulOutcome", "MeasurementResponse", RESPONSE),
+        ("initiatingMessage", "MeasurementReport", "TRP-MeasurementReportList"),
+    ],
+)
+def test_a_whole_pdu_is_unwrapped(outcome: str, name: str, key: str):
+    """What only the location server knows stands beside it."""
+    content = {key: message(item({"uL-AngleOfArrival": aoa(123, 900)}))[RESPONSE]}
+    beside = {"target_id": "ue-7", "stations": {"7": "bs1"}}
+    assert parse_nrppa({**pdu(content, outcome=outcome, name=name), **beside}) == parse_nrppa({**content, **beside})
+
+
+@pytest.mark.parametrize(
+    ("document", "words"),
+    [
+        ({"unsuccessfulOutcome": {}}, "unsuccessfulOutcome tells that the measurement failed"),
+        (pdu({}, name="PositioningInformationResponse"), "holds PositioningInformationResponse; give one with Meas"),
+        ({"successfulOutcome": {"value": 3}}, "has no array protocolIEs"),
+        ({"successfulOutcome": []}, "has no array protocolIEs"),
+        (pdu({}), "has no measurements"),
+    ],
+)
+def test_other_pdus_are_refused(document: dict[str, Any], words: str):
+    with pytest.raises(InvalidReportError, match=words):
+        parse_nrppa(document)
+
+
+def test_a_byte_order_mark_is_passed_over():
+    content = message(item({"uL-AngleOfArrival": aoa(123, 900)}))
+    text = json.dumps(content).encode()
+    assert parse_nrppa(b"\xef\xbb\xbf" + text) == parse_nrppa(text)

@@ -122,7 +122,7 @@ def test_without_sequence_number_an_anchor_that_speaks_again_begins_anew():
         (TEN.replace("40871", "x"), "line 1 has sequence number 'x'"),
         (line("", "a"), "line 1 has instance id ''; give 1 to 128 characters"),
         (line("t", ""), "line 1 has anchor id ''; give 1 to 128 characters"),
-        ("OK\n+STARTUP\n", r"no line begins with \+UUDF:; give at least one"),
+        ("OK\n+STARTUP\n", r"no line holds \+UUDF:; give at least one"),
     ],
 )
 def test_refusals_name_the_line_and_the_remedy(text: str, words: str):
@@ -138,3 +138,17 @@ def test_a_line_of_another_kind_is_refused():
 def test_too_many_reports_are_refused():
     with pytest.raises(InvalidReportError, match="more than 1000 reports; give at most 1000"):
         parse_ublox("\n".join([line("t", "a")] * 1001))
+
+
+def test_events_in_a_log_are_found_in_their_lines():
+    """What stands before them is passed over; other lines are counted in the first report."""
+    plain = [line("t", "a"), line("t", "b"), line("t", "c"), line("t", "a")]
+    log = [f"12:00:01 -> {text}" for text in plain]
+    found = parse_ublox("\n".join(["+STARTUP", "", log[0], "OK", *log[1:3], f"[INFO] {plain[3]}", "OK"]))
+    expected = parse_ublox("\n".join(plain))
+    assert [adapted.report for adapted in found] == [adapted.report for adapted in expected]
+    assert found[0].sources == (("lines", 2), ("lines", 4), ("lines", 5))
+    assert [(skip.path, skip.reason) for skip in found[0].skipped] == [
+        (("lines", 0), "this line and 2 more lines hold no +UUDF:")
+    ]
+    assert [adapted.skipped for adapted in (*found[1:], *expected)] == [()] * 3

@@ -222,3 +222,8 @@ def test_the_batch_examples_hold_reports():
     for batch in BATCH_EXAMPLES.values():
         for report in batch["value"]["reports"]:
             parse_report(report)
+
+
+def test_a_byte_order_mark_is_passed_over() -> None:
+    text = b'{"measurements": [{"type": "pt", "station_id": "bs1", "range_m": 6.0, "stdev_m": 0.15}]}'
+    assert parse_report(b"\xef\xbb\xbf" + text) == parse_report(text)
