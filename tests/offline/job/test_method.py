@@ -24,6 +24,7 @@ OF_TABLES = (
     "gaussians.definite",
     "gaussians.normal_points",
     "gaussians.tree_reduction",
+    "gaussians.triangles",
     "level",
     "grid",
     "mixture",
