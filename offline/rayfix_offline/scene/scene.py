@@ -33,6 +33,9 @@ UPRIGHT = {
 
 _MIN_AREA = 1e-12
 
+_MOST_MATERIALS = int(np.iinfo(np.int16).max) + 1
+"""Indices of materials have two bytes in a table."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
@@ -120,7 +123,7 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
         raise SceneError(f"{path} holds no triangles; export the scene as a triangle mesh")
     if not all(np.isfinite(mesh.vertices).all() and np.isfinite(transform).all() for _, mesh, transform in meshes):
         raise SceneError(f"{path} has coordinates that are not finite; export the scene again")
-    scene = replace(_gather(meshes, scale=scale, up=said_up or up), says_up=said_up is not None)
+    scene = replace(_gather(path, meshes, scale=scale, up=said_up or up), says_up=said_up is not None)
     if not len(scene.faces):
         raise SceneError(f"{path} has only triangles without an area; export the scene again")
     return scene
@@ -158,10 +161,10 @@ def _placed_meshes(loaded: Any) -> list[Placed]:
     return meshes
 
 
-def _gather(meshes: list[Placed], *, scale: float, up: str) -> Scene:
+def _gather(path: Path, meshes: list[Placed], *, scale: float, up: str) -> Scene:
     turn = UPRIGHT[up]
     vertices, faces, face_materials, face_objects = [], [], [], []
-    materials: list[str] = []
+    materials: dict[str, int] = {}
     count = 0
     for index, (_, mesh, transform) in enumerate(meshes):
         points = trimesh.transformations.transform_points(np.asarray(mesh.vertices, np.float64), transform)
@@ -169,10 +172,14 @@ def _gather(meshes: list[Placed], *, scale: float, up: str) -> Scene:
         faces.append(np.asarray(mesh.faces, np.int64) + count)
         count += len(points)
         material = getattr(getattr(mesh.visual, "material", None), "name", None)
-        if material and material not in materials:
-            materials.append(material)
-        face_materials.append(np.full(len(mesh.faces), materials.index(material) if material else -1))
+        number = materials.setdefault(material, len(materials)) if material else -1
+        face_materials.append(np.full(len(mesh.faces), number))
         face_objects.append(np.full(len(mesh.faces), index))
+    if len(materials) > _MOST_MATERIALS:
+        raise SceneError(
+            f"{path} has {len(materials):,} materials, a table holds {_MOST_MATERIALS:,} at most; give objects of one "
+            "building material the same material"
+        )
     all_vertices = np.concatenate(vertices)
     all_faces = np.concatenate(faces)
     a, b, c = (all_vertices[all_faces[:, i]] for i in range(3))

@@ -64,6 +64,7 @@ NOT_IN_IDENTITY = {
     "offline.scene.scene.METRES_PER_UNIT": BY_CHECKSUM,
     "offline.scene.scene.UPRIGHT": BY_CHECKSUM,
     "offline.scene.scene._MIN_AREA": BY_CHECKSUM,
+    "offline.scene.scene._MOST_MATERIALS": "a limit on what is read; beyond it the file is refused",
     "offline.scene.materials.Reflectivity.log_gain": DEFINITION,
     "offline.scene.materials.Reflectivity.power": DEFINITION,
     "offline.scene.materials.complex_permittivity": DEFINITION,
