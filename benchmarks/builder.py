@@ -25,7 +25,7 @@ from held_out import COMPONENT_BYTES
 from rayfix.example.files import write_example
 from rayfix_offline.fit.cells import assemble_level, fit_cells, widen_cells
 from rayfix_offline.fit.em import fit_em
-from rayfix_offline.fit.moments import gather_groups, gathered_arrays, new_rows
+from rayfix_offline.fit.moments import gather_groups, gathered_rays, new_rows
 from rayfix_offline.fit.settings import CoarseFit, ExpectationMaximisation, RayFit, TubeFit
 from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.rays.launch import launch
@@ -197,10 +197,10 @@ def scattered_blocks(num_cells: int, most: int, rng: np.random.Generator) -> NDA
 
 def gather_cells(centres: NDArray[np.float64], level: LevelRays) -> None:
     """Gather the groups of cells, and no more."""
-    arrays = gathered_arrays(level.rays, level.pieces, level.sequences)
+    gathered = gathered_rays(level.rays, level.pieces, level.sequences)
     num_slices, rows = level.pieces.num_slices, new_rows(len(level.sequences.images))
     for centre in centres:
-        gather_groups(*centre, level.window, RayFit.cutoff, *arrays, num_slices, rows)
+        gather_groups(*centre, level.window, RayFit.cutoff, gathered, num_slices, rows)
 
 
 def print_stages(seconds: dict[str, float]) -> None:

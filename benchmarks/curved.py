@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from held_out import log_densities
 from rayfix_offline.fit.em import sample_points
 from rayfix_offline.fit.join_surfaces import join_groups
-from rayfix_offline.fit.moments import gather_groups, new_rows
+from rayfix_offline.fit.moments import gather_groups, gathered_rays, new_rows
 from rayfix_offline.fit.settings import TubeFit
 from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.rays.trace import LevelRays, trace_station
@@ -128,15 +128,13 @@ def measure(level: LevelRays, cells: NDArray[np.int64], points: list[NDArray[np.
     """Fit cells and judge them on held-out points."""
     fit = TubeFit()
     centres = level.grid.centres[cells]
-    rays, pieces, sequences = level.rays, level.pieces, level.sequences
+    sequences = level.sequences
+    gathered = gathered_rays(level.rays, level.pieces, sequences)
     groups, kept = [], []
     for centre in centres:
         seq, slices, mass, mean, cov = gather_groups(
-            *centre, level.window, fit.cutoff, rays.grid.ring_offsets, rays.grid.ring_cells, rays.azimuth, rays.zenith,
-            rays.solid_angle, rays.directions, pieces.offsets, pieces.sequence, pieces.slice, pieces.mass,
-            pieces.mean, pieces.variance, sequences.images, sequences.mirrors, pieces.num_slices,
-            new_rows(len(sequences.images)),
-        )  # fmt: skip
+            *centre, level.window, fit.cutoff, gathered, level.pieces.num_slices, new_rows(len(sequences.images))
+        )
         surface = level.surface_sequences[seq]
         mass = join_groups(surface, slices, mass, mean, cov, sequences.mirrors[seq])[1]
         groups.append(len(mass))

@@ -4,7 +4,7 @@ The joint vector is (path length, horizontal angle, vertical angle, x, y, z); th
 cell.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -34,24 +34,75 @@ def ring_span(azimuth: Any, reach: Any, cells: Any) -> Any:
     return int(np.floor(middle - half)), int(np.floor(middle + half)) + 1
 
 
-def gathered_arrays(rays: RaySet, pieces: Pieces, sequences: Sequences) -> tuple[NDArray[Any], ...]:
-    """Return what cells gather, in the order in which :func:`gather_groups` takes it, from ``ring_offsets`` on."""
-    return (
-        rays.grid.ring_offsets,
-        rays.grid.ring_cells,
-        rays.azimuth,
-        rays.zenith,
-        rays.solid_angle,
-        rays.directions,
-        pieces.offsets,
-        pieces.sequence,
-        pieces.slice,
-        pieces.mass,
-        pieces.mean,
-        pieces.variance,
-        sequences.images,
-        sequences.mirrors,
+class GatheredRays(NamedTuple):
+    """What cells gather, as the kernels read it.
+
+    Attributes
+    ----------
+    ring_offsets, ring_cells
+        Of the grid that has a ray in each of its cells; as in :class:`~rayfix_tables.grid.AngularGrid`.
+    azimuth, zenith, solid_angle, directions
+        As in :class:`~rayfix_offline.rays.rays.RaySet`.
+    offsets, sequence, slice, mass, mean, variance
+        As in :class:`~rayfix_offline.rays.pieces.Pieces`.
+    images, mirrors
+        As in :class:`~rayfix_offline.rays.segments.Sequences`.
+    """
+
+    ring_offsets: NDArray[np.int64]
+    ring_cells: NDArray[np.int64]
+    azimuth: NDArray[np.float64]
+    zenith: NDArray[np.float64]
+    solid_angle: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    offsets: NDArray[np.int64]
+    sequence: NDArray[np.int32]
+    slice: NDArray[np.int16]
+    mass: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    images: NDArray[np.float64]
+    mirrors: NDArray[np.float64]
+
+
+def gathered_rays(rays: RaySet, pieces: Pieces, sequences: Sequences) -> GatheredRays:
+    """Return what cells gather."""
+    return GatheredRays(
+        ring_offsets=rays.grid.ring_offsets,
+        ring_cells=rays.grid.ring_cells,
+        azimuth=rays.azimuth,
+        zenith=rays.zenith,
+        solid_angle=rays.solid_angle,
+        directions=rays.directions,
+        offsets=pieces.offsets,
+        sequence=pieces.sequence,
+        slice=pieces.slice,
+        mass=pieces.mass,
+        mean=pieces.mean,
+        variance=pieces.variance,
+        images=sequences.images,
+        mirrors=sequences.mirrors,
     )
+
+
+class _Groups(NamedTuple):
+    """Groups of a cell while they are summed up.
+
+    Attributes
+    ----------
+    rows : ndarray of int32, shape (n_sequences,)
+        Row of ``slots`` that a sequence has, -1 for none.
+    slots : ndarray of int32, shape (capacity, n_slices)
+        Group of a sequence and slice, -1 for none.
+    keys : ndarray of int64, shape (capacity, 2)
+        Sequence and slice of each group.
+    sums : ndarray of shape (capacity, NUM_SUMS)
+    """
+
+    rows: NDArray[np.int32]
+    slots: NDArray[np.int32]
+    keys: NDArray[np.int64]
+    sums: NDArray[np.float64]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -60,20 +111,7 @@ def gather_groups(
     centre_zenith: Any,
     window: Any,
     cutoff: Any,
-    ring_offsets: Any,
-    ring_cells: Any,
-    azimuth: Any,
-    zenith: Any,
-    solid_angle: Any,
-    directions: Any,
-    piece_offsets: Any,
-    piece_sequence: Any,
-    piece_slice: Any,
-    piece_mass: Any,
-    piece_mean: Any,
-    piece_variance: Any,
-    images: Any,
-    mirrors: Any,
+    rays: Any,
     num_slices: Any,
     rows: Any,
 ) -> Any:
@@ -88,6 +126,7 @@ def gather_groups(
         Standard deviation of the cell's window.
     cutoff : float
         Rays are gathered within this many standard deviations.
+    rays : GatheredRays
     num_slices : int
         Slices are numbered below this.
     rows : ndarray of int32, shape (n_sequences,)
@@ -109,45 +148,30 @@ def gather_groups(
     num_rows = np.int64(0)
     sine = np.sin(centre_zenith)
     reach = cutoff * window
-    num_rings = len(ring_cells)
+    num_rings = len(rays.ring_cells)
     first_ring = max(0, int((centre_zenith - reach) / np.pi * num_rings))
     last_ring = min(num_rings - 1, int((centre_zenith + reach) / np.pi * num_rings))
     for ring in range(first_ring, last_ring + 1):
-        cells = ring_cells[ring]
+        cells = rays.ring_cells[ring]
         begin, stop = ring_span(centre_azimuth, reach / sine, cells)
         for step in range(begin, stop):
-            ray = ring_offsets[ring] + step % cells
-            turn = azimuth[ray] - centre_azimuth
+            ray = rays.ring_offsets[ring] + step % cells
+            turn = rays.azimuth[ray] - centre_azimuth
             turn -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
             horizontal = sine * turn
-            vertical = zenith[ray] - centre_zenith
+            vertical = rays.zenith[ray] - centre_zenith
             square = (horizontal * horizontal + vertical * vertical) / (window * window)
             if square > cutoff * cutoff:
                 continue
-            density = np.exp(-0.5 * square) / (2.0 * np.pi * window * window) * solid_angle[ray]
-            first, last = piece_offsets[ray], piece_offsets[ray + 1]
+            density = np.exp(-0.5 * square) / (2.0 * np.pi * window * window) * rays.solid_angle[ray]
+            first, last = rays.offsets[ray], rays.offsets[ray + 1]
             if count + last - first > len(sums):
                 capacity = 2 * (count + last - first)
                 keys, sums = _grown(keys, capacity, 0), _grown(sums, capacity, 0)
             if num_rows + last - first > len(slots):
                 slots = _grown(slots, 2 * (num_rows + last - first), -1)
-            count, num_rows = _add_ray(
-                density,
-                horizontal,
-                vertical,
-                directions[ray],
-                piece_sequence[first:last],
-                piece_slice[first:last],
-                piece_mass[first:last],
-                piece_mean[first:last],
-                piece_variance[first:last],
-                rows,
-                slots,
-                keys,
-                sums,
-                count,
-                num_rows,
-            )
+            groups = _Groups(rows, slots, keys, sums)
+            count, num_rows = _add_ray(density, horizontal, vertical, ray, rays, groups, count, num_rows)
 
     masses = np.empty(count)
     means = np.empty((count, SIZE))
@@ -155,7 +179,7 @@ def gather_groups(
     for group in range(count):
         rows[keys[group, 0]] = -1
         masses[group] = sums[group, 0]
-        _to_moments(sums[group], images[keys[group, 0]], mirrors[keys[group, 0]], means[group], covs[group])
+        _to_moments(sums[group], rays.images[keys[group, 0]], rays.mirrors[keys[group, 0]], means[group], covs[group])
     return keys[:count, 0], keys[:count, 1], masses, means, covs
 
 
@@ -164,16 +188,9 @@ def _add_ray(
     density: Any,
     horizontal: Any,
     vertical: Any,
-    heading: Any,
-    sequence: Any,
-    slices: Any,
-    piece_mass: Any,
-    piece_mean: Any,
-    piece_variance: Any,
-    rows: Any,
-    slots: Any,
-    keys: Any,
-    sums: Any,
+    ray: Any,
+    rays: Any,
+    groups: Any,
     count: Any,
     num_rows: Any,
 ) -> Any:
@@ -182,25 +199,28 @@ def _add_ray(
     What is added is mass, mass x length and mass x length^2, times products of a and d. It is written out, so that
     the products stay in the processor's registers for all pieces of the ray: in loops it takes three times as long.
     """
-    x, y, z = heading[0], heading[1], heading[2]
-    for piece in range(len(piece_mass)):
-        mass = density * piece_mass[piece]
+    x, y, z = rays.directions[ray, 0], rays.directions[ray, 1], rays.directions[ray, 2]
+    slots, keys, sums = groups.slots, groups.keys, groups.sums
+    for piece in range(rays.offsets[ray], rays.offsets[ray + 1]):
+        mass = density * rays.mass[piece]
         if mass <= 0.0:
             continue
-        row = rows[sequence[piece]]
+        sequence, number = rays.sequence[piece], rays.slice[piece]
+        row = groups.rows[sequence]
         if row < 0:
             row = num_rows
             num_rows += 1
-            rows[sequence[piece]] = row
-        group = slots[row, slices[piece]]
+            groups.rows[sequence] = row
+        group = slots[row, number]
         if group < 0:
             group = count
             count += 1
-            slots[row, slices[piece]] = group
-            keys[group, 0] = sequence[piece]
-            keys[group, 1] = slices[piece]
-        once = mass * piece_mean[piece]
-        twice = mass * (piece_variance[piece] + piece_mean[piece] * piece_mean[piece])
+            slots[row, number] = group
+            keys[group, 0] = sequence
+            keys[group, 1] = number
+        mean = rays.mean[piece]
+        once = mass * mean
+        twice = mass * (rays.variance[piece] + mean * mean)
         sums[group, 0] += mass
         sums[group, 1] += mass * horizontal
         sums[group, 2] += mass * vertical

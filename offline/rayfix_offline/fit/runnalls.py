@@ -14,6 +14,7 @@ import numba
 import numpy as np
 
 from rayfix_tables.gaussians.tree_reduction import SMALLEST_PIVOT
+from rayfix_tables.gaussians.triangles import pack_lower, triangle, unpack_lower
 
 LANES = 128
 """Pairs whose determinants are computed side by side; their matrices fit the processor's first cache."""
@@ -60,17 +61,17 @@ def union_log_dets(i: Any, first: Any, stop: Any, weight: Any, mean: Any, cov: A
                     union[place, k] = other + share[k] * (cov[place, i] - other) + spread[k] * apart[a, k] * apart[b, k]
                 place += 1
         for j in range(size):
-            diagonal = j * (j + 3) // 2
+            diagonal = triangle(j) + j
             for k in range(width):
                 pivot = max(union[diagonal, k], SMALLEST_PIVOT)
                 product[k] *= pivot
                 inverse[k] = 1.0 / pivot
             for a in range(j + 1, size):
-                row = a * (a + 1) // 2
+                row = triangle(a)
                 for k in range(width):
                     factor[k] = union[row + j, k] * inverse[k]
                 for b in range(j + 1, a + 1):
-                    column = b * (b + 1) // 2 + j
+                    column = triangle(b) + j
                     for k in range(width):
                         union[row + b, k] -= factor[k] * union[column, k]
         for k in range(width):
@@ -81,7 +82,7 @@ def union_log_dets(i: Any, first: Any, stop: Any, weight: Any, mean: Any, cov: A
 @numba.njit(cache=True, nogil=True)
 def new_scratch(size: Any) -> Any:
     """Room for :func:`union_log_dets` of components of ``size`` dimensions."""
-    return np.empty((5 + size + size * (size + 1) // 2, LANES))
+    return np.empty((5 + size + triangle(size), LANES))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -133,14 +134,11 @@ def merge_runnalls(weight: Any, mean: Any, cov: Any, label: Any, max_components:
     """
     count, size = mean.shape
     middle = np.empty((size, count))
-    triangle = np.empty((size * (size + 1) // 2, count))
+    packed = np.empty((triangle(size), count))
     for i in range(count):
-        place = 0
+        pack_lower(cov[i], packed, i)
         for a in range(size):
             middle[a, i] = mean[i, a]
-            for b in range(a + 1):
-                triangle[place, i] = cov[i, a, b]
-                place += 1
     scratch = new_scratch(size)
     alive = np.ones(count, np.bool_)
     cost = np.empty((count, count))  # of a pair, at the lower number's row
@@ -149,7 +147,7 @@ def merge_runnalls(weight: Any, mean: Any, cov: Any, label: Any, max_components:
     partner = np.empty(count, np.int64)
     least = np.empty(count)
     for i in range(count):
-        union_log_dets(i, i, count, weight, middle, triangle, scratch, cost[i])
+        union_log_dets(i, i, count, weight, middle, packed, scratch, cost[i])
         log_det[i] = cost[i, i]
     for i in range(count):
         for k in range(i + 1, count):
@@ -164,14 +162,14 @@ def merge_runnalls(weight: Any, mean: Any, cov: Any, label: Any, max_components:
         j = partner[i]
         if weight[j] > weight[i]:
             label[i] = label[j]
-        _unite(i, j, weight, middle, triangle)
+        _unite(i, j, weight, middle, packed)
         alive[j] = False
         least[j] = np.inf
         left -= 1
         for k in range(j):
             cost[k, j] = np.inf
         # A plain 0 would have it compiled once more, for a constant.
-        union_log_dets(i, np.int64(0), count, weight, middle, triangle, scratch, row)
+        union_log_dets(i, np.int64(0), count, weight, middle, packed, scratch, row)
         log_det[i] = row[i]
         for k in range(count):
             if alive[k] and k != i:
@@ -187,11 +185,7 @@ def merge_runnalls(weight: Any, mean: Any, cov: Any, label: Any, max_components:
     for i in range(count):
         if not alive[i]:
             continue
-        place = 0
+        unpack_lower(packed, i, cov[i])
         for a in range(size):
             mean[i, a] = middle[a, i]
-            for b in range(a + 1):
-                cov[i, a, b] = triangle[place, i]
-                cov[i, b, a] = triangle[place, i]
-                place += 1
     return alive

@@ -1,5 +1,6 @@
 """``fit = "tubes"``: cells fitted by analytic moments of their ray pieces, then merged."""
 
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numba
@@ -7,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.fit.join_surfaces import join_groups
-from rayfix_offline.fit.moments import blur, gather_groups, gathered_arrays, new_rows
+from rayfix_offline.fit.moments import blur, gather_groups, gathered_rays, new_rows
 from rayfix_offline.fit.runnalls import merge_runnalls
 from rayfix_offline.fit.settings import TubeFit
 from rayfix_offline.rays.trace import LevelRays
@@ -36,6 +37,18 @@ class Fitted(NamedTuple):
     dropped: NDArray[np.int64]
 
 
+class _Numbers(NamedTuple):
+    """:class:`~rayfix_offline.fit.settings.TubeFit`, as the kernel reads it."""
+
+    cutoff: float
+    position_floor: float
+    length_floor: float
+    dropped_mass: float
+    max_groups: int
+    max_components: int
+    max_divergence: float
+
+
 def fit_tubes(centres: NDArray[np.float64], level: LevelRays, fit: TubeFit) -> Fitted:
     """Fit a block of cells.
 
@@ -48,18 +61,12 @@ def fit_tubes(centres: NDArray[np.float64], level: LevelRays, fit: TubeFit) -> F
     counts, log_mass, log_weight, mean, cov, label = _fit_block(
         centres,
         level.window,
-        fit.cutoff,
-        *gathered_arrays(level.rays, level.pieces, sequences),
+        gathered_rays(level.rays, level.pieces, sequences),
         level.surface_sequences,
         bool(np.any(level.surface_sequences != np.arange(len(sequences.images)))),
         level.pieces.num_slices,
         level.ray_spacing,
-        fit.dropped_mass,
-        fit.max_groups,
-        fit.max_components,
-        fit.max_divergence,
-        fit.length_floor,
-        fit.position_floor,
+        _Numbers(**asdict(fit)),
         new_rows(len(sequences.images)),
     )
     return fitted_cells(
@@ -148,65 +155,28 @@ def joint_to_tubes(
 def _fit_block(
     centres: Any,
     window: Any,
-    cutoff: Any,
-    ring_offsets: Any,
-    ring_cells: Any,
-    azimuth: Any,
-    zenith: Any,
-    solid_angle: Any,
-    directions: Any,
-    piece_offsets: Any,
-    piece_sequence: Any,
-    piece_slice: Any,
-    piece_mass: Any,
-    piece_mean: Any,
-    piece_variance: Any,
-    images: Any,
-    mirrors: Any,
+    rays: Any,
     surface_sequences: Any,
     curved: Any,
     num_slices: Any,
     ray_spacing: Any,
-    dropped_mass: Any,
-    max_groups: Any,
-    max_components: Any,
-    max_divergence: Any,
-    length_floor: Any,
-    position_floor: Any,
+    fit: Any,
     rows: Any,
 ) -> Any:
+    """Fit cells; ``rays`` are :class:`GatheredRays` and ``fit`` is :class:`_Numbers`."""
     num_cells = len(centres)
     counts = np.zeros(num_cells, np.int64)
     log_mass = np.full(num_cells, -np.inf)
-    log_weight = np.empty(num_cells * max_components)
-    mean = np.empty((num_cells * max_components, 6))
-    cov = np.empty((num_cells * max_components, 6, 6))
-    label = np.empty(num_cells * max_components, np.int64)
+    log_weight = np.empty(num_cells * fit.max_components)
+    mean = np.empty((num_cells * fit.max_components, 6))
+    cov = np.empty((num_cells * fit.max_components, 6, 6))
+    label = np.empty(num_cells * fit.max_components, np.int64)
     total = 0
     for cell in range(num_cells):
         seq, slices, mass, group_mean, group_cov = gather_groups(
-            centres[cell, 0],
-            centres[cell, 1],
-            window,
-            cutoff,
-            ring_offsets,
-            ring_cells,
-            azimuth,
-            zenith,
-            solid_angle,
-            directions,
-            piece_offsets,
-            piece_sequence,
-            piece_slice,
-            piece_mass,
-            piece_mean,
-            piece_variance,
-            images,
-            mirrors,
-            num_slices,
-            rows,
+            centres[cell, 0], centres[cell, 1], window, fit.cutoff, rays, num_slices, rows
         )
-        group_mirror = mirrors[seq]
+        group_mirror = rays.mirrors[seq]
         if curved:
             seq, mass, group_mean, group_cov, group_mirror = join_groups(
                 surface_sequences[seq], slices, mass, group_mean, group_cov, group_mirror
@@ -217,7 +187,7 @@ def _fit_block(
         order = np.argsort(-mass)
         kept = 0
         gone = whole
-        while kept < min(len(mass), max_groups) and gone > dropped_mass * whole:
+        while kept < min(len(mass), fit.max_groups) and gone > fit.dropped_mass * whole:
             gone -= mass[order[kept]]
             kept += 1
         chosen = order[:kept]
@@ -234,10 +204,10 @@ def _fit_block(
                 centres[cell, 0],
                 centres[cell, 1],
                 ray_spacing,
-                length_floor,
-                position_floor,
+                fit.length_floor,
+                fit.position_floor,
             )
-        alive = merge_runnalls(weight, part_mean, part_cov, part_label, max_components, max_divergence)
+        alive = merge_runnalls(weight, part_mean, part_cov, part_label, fit.max_components, fit.max_divergence)
         log_mass[cell] = np.log(whole)
         for i in range(kept):
             if alive[i]:

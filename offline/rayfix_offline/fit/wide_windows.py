@@ -10,7 +10,7 @@ looked up for angles with more noise than the finer level serves. They are merge
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -20,8 +20,49 @@ from rayfix_offline.fit.moments import SIZE
 from rayfix_offline.fit.settings import CoarseFit
 from rayfix_offline.fit.tubes import fitted_cells
 from rayfix_tables.gaussians.tree_reduction import halve_and_merge
+from rayfix_tables.gaussians.triangles import unpack_upper
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture
+
+
+class _FinerCells(NamedTuple):
+    """The finer level, as the kernel reads it; fields as in its grid, in :class:`Level` and in its mixture."""
+
+    window: float
+    ring_offsets: NDArray[np.int64]
+    ring_cells: NDArray[np.int64]
+    solid_angles: NDArray[np.float64]
+    cell_offsets: NDArray[np.int64]
+    cell_log_mass: NDArray[np.float64]
+    cell_change: NDArray[np.float64]
+    log_weight: NDArray[np.float32]
+    u_mean: NDArray[np.float32]
+    u_cov: NDArray[np.float32]
+    x_mean: NDArray[np.float32]
+    jacobian: NDArray[np.float32]
+    x_cov: NDArray[np.float32]
+    num_reflections: NDArray[np.int8]
+
+    @classmethod
+    def of(cls, level: Level, change: NDArray[np.float64]) -> "_FinerCells":
+        """Return the cells of a level, and bounds on their changes as fractions of their present masses."""
+        grid, mixture = level.grid, level.mixture
+        return cls(
+            window=level.window,
+            ring_offsets=grid.ring_offsets,
+            ring_cells=grid.ring_cells,
+            solid_angles=grid.solid_angles,
+            cell_offsets=level.cell_offsets,
+            cell_log_mass=level.cell_log_mass,
+            cell_change=change,
+            log_weight=mixture.log_weight,
+            u_mean=mixture.u_mean,
+            u_cov=mixture.u_cov,
+            x_mean=mixture.x_mean,
+            jacobian=mixture.jacobian,
+            x_cov=mixture.x_cov,
+            num_reflections=mixture.num_reflections,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +98,7 @@ def sum_cells(
     Parameters
     ----------
     centres : ndarray of shape (n_cells, 2), rad
-        Azimuths and zeniths.
+        Azimuths and zeniths of at least one cell.
     window : float, rad
         At least ``LEAST_WINDOW_RATIO`` of the site file times the finer level's.
     finer_change : ndarray of shape (n_finer_cells,)
@@ -68,53 +109,28 @@ def sum_cells(
     noise = np.array([fit.range_stdev**2, angle**2, angle**2, 0.0, 0.0, 0.0])
     # A change is a share of the mass as it would be, and what is summed are masses as they are.
     of_present = finer_change / np.maximum(1.0 - finer_change, 0.5)
-    counts, dropped = np.zeros(len(centres), np.int64), np.zeros(len(centres), np.int64)
     log_mass, change = np.empty(len(centres)), np.empty(len(centres))
-    mixture = finer.mixture
+    cells = _FinerCells.of(finer, of_present)
     parts = []
     for n, (azimuth, zenith) in enumerate(centres):
-        whole, change[n], weight, mean, cov, num_reflections = _sum_cell(
+        log_mass[n], change[n], *components = _sum_cell(
             azimuth,
             zenith,
             window,
-            finer.window,
-            finer.grid.ring_offsets,
-            finer.grid.ring_cells,
-            finer.grid.solid_angles,
-            finer.cell_offsets,
-            finer.cell_log_mass,
-            of_present,
-            mixture.log_weight,
-            mixture.u_mean,
-            mixture.u_cov,
-            mixture.x_mean,
-            mixture.jacobian,
-            mixture.x_cov,
-            mixture.num_reflections,
+            cells,
             noise,
             fit.reach,
             fit.max_divergence,
             fit.length_stretch,
             fit.least_length,
         )
-        summed = fitted_cells(
-            np.array([len(weight)]),
-            np.array([whole]),
-            np.log(weight),
-            mean,
-            cov,
-            num_reflections,
-            position_floor=fit.position_floor,
-        )
-        counts[n], log_mass[n], dropped[n] = summed.counts[0], summed.log_mass[0], summed.dropped[0]
-        parts.append(summed.mixture)
-    return SummedCells(
-        counts=counts,
-        log_mass=log_mass,
-        change=change / np.maximum(1.0 - change, 0.5),
-        mixture=TubeMixture.concatenate(parts),
-        dropped=dropped,
+        parts.append(components)
+    weight, mean, cov, num_reflections = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    counts = np.array([len(components[0]) for components in parts])
+    fitted = fitted_cells(
+        counts, log_mass, np.log(weight), mean, cov, num_reflections, position_floor=fit.position_floor
     )
+    return SummedCells(change=change / np.maximum(1.0 - change, 0.5), **fitted._asdict())
 
 
 @numba.njit(cache=True, nogil=True)
@@ -132,16 +148,13 @@ def _scale(weight: Any, mean: Any, noise: Any, length_stretch: Any, least_length
 
 
 @numba.njit(cache=True, nogil=True)
-def _joint(k: Any, u_mean: Any, u_cov: Any, x_mean: Any, jacobian: Any, x_cov: Any, mean: Any, cov: Any) -> None:
-    """Mean and covariance of (u, x) of a stored component, with its widening."""
-    place = 0
+def _joint(k: Any, stored: Any, mean: Any, cov: Any) -> None:
+    """Mean and covariance of (u, x) of a component of :class:`_FinerCells`, with its widening."""
+    jacobian = stored.jacobian
+    unpack_upper(stored.u_cov, k, cov, 0)
+    unpack_upper(stored.x_cov, k, cov, 3)
     for i in range(3):
-        mean[i], mean[3 + i] = u_mean[k, i], x_mean[k, i]
-        for j in range(i, 3):
-            cov[i, j] = u_cov[k, place]
-            cov[j, i] = u_cov[k, place]
-            cov[3 + i, 3 + j] = x_cov[k, place]
-            place += 1
+        mean[i], mean[3 + i] = stored.u_mean[k, i], stored.x_mean[k, i]
     for i in range(3):
         for j in range(3):
             total = 0.0
@@ -165,20 +178,7 @@ def _sum_cell(
     azimuth: Any,
     zenith: Any,
     window: Any,
-    fine_window: Any,
-    ring_offsets: Any,
-    ring_cells: Any,
-    solid_angles: Any,
-    offsets: Any,
-    cell_log_mass: Any,
-    cell_change: Any,
-    log_weight: Any,
-    u_mean: Any,
-    u_cov: Any,
-    x_mean: Any,
-    jacobian: Any,
-    x_cov: Any,
-    num_reflections: Any,
+    finer: Any,
     noise: Any,
     reach: Any,
     max_divergence: Any,
@@ -186,6 +186,8 @@ def _sum_cell(
     least_length: Any,
 ) -> Any:
     """Sum the cells around a direction: log mass, change, weights, means, covariances and numbers of reflections."""
+    fine_window, ring_offsets, ring_cells = finer.window, finer.ring_offsets, finer.ring_cells
+    offsets, cell_log_mass = finer.cell_offsets, finer.cell_log_mass
     num_rings = len(ring_cells)
     sine = np.sin(zenith)
     vertical = window * window - fine_window * fine_window
@@ -215,7 +217,7 @@ def _sum_cell(
                 continue
             cells.append(cell)
             density = np.exp(-0.5 * square) / (2.0 * np.pi * np.sqrt(horizontal * vertical))
-            logs.append(np.log(density * solid_angles[ring]) + cell_log_mass[cell])
+            logs.append(np.log(density * finer.solid_angles[ring]) + cell_log_mass[cell])
             moved.append((across, down, stretch))
             total += offsets[cell + 1] - offsets[cell]
     weight, label = np.empty(total), np.empty(total, np.int8)
@@ -230,11 +232,11 @@ def _sum_cell(
         across, down, stretch = moved[n]
         share = np.exp(logs[n] - top)
         mass += share
-        change += share * cell_change[cells[n]]
+        change += share * finer.cell_change[cells[n]]
         for k in range(offsets[cells[n]], offsets[cells[n] + 1]):
-            weight[place] = share * np.exp(np.float64(log_weight[k]))
-            label[place] = num_reflections[k]
-            _joint(k, u_mean, u_cov, x_mean, jacobian, x_cov, mean[place], cov[place])
+            weight[place] = share * np.exp(np.float64(finer.log_weight[k]))
+            label[place] = finer.num_reflections[k]
+            _joint(k, finer, mean[place], cov[place])
             mean[place, 1] = across + stretch * mean[place, 1]
             mean[place, 2] += down
             for i in range(SIZE):

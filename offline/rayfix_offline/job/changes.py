@@ -8,7 +8,7 @@ exactly 0, and their fit is the same to the last bit.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -33,6 +33,36 @@ class ComparisonSettings:
     """
 
     same_course: float = 1e-6
+
+
+class _Trace(NamedTuple):
+    """Pieces and sequences of a trace, as the kernel reads them."""
+
+    offsets: NDArray[np.int64]
+    sequence: NDArray[np.int32]
+    slice: NDArray[np.int16]
+    mass: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    images: NDArray[np.float64]
+    mirrors: NDArray[np.float64]
+    surfaces: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, level: LevelRays) -> "_Trace":
+        """Return the trace of a level."""
+        pieces, sequences = level.pieces, level.sequences
+        return cls(
+            offsets=pieces.offsets,
+            sequence=pieces.sequence,
+            slice=pieces.slice,
+            mass=pieces.mass,
+            mean=pieces.mean,
+            variance=pieces.variance,
+            images=sequences.images,
+            mirrors=sequences.mirrors,
+            surfaces=level.surface_sequences,
+        )
 
 
 def cell_changes(
@@ -93,79 +123,40 @@ def ray_changes(
     same : ndarray of bool, shape (n_rays,)
         Whether all pieces are the same to the last bit.
     """
-    a, b = old.pieces, new.pieces
-    change, mass, same = _compare(
-        a.offsets,
-        a.sequence,
-        a.slice,
-        a.mass,
-        a.mean,
-        a.variance,
-        old.sequences.images,
-        old.sequences.mirrors,
-        old.surface_sequences,
-        b.offsets,
-        b.sequence,
-        b.slice,
-        b.mass,
-        b.mean,
-        b.variance,
-        new.sequences.images,
-        new.sequences.mirrors,
-        new.surface_sequences,
-        (settings or ComparisonSettings()).same_course,
-    )
+    same_course = (settings or ComparisonSettings()).same_course
+    change, mass, same = _compare(_Trace.of(old), _Trace.of(new), same_course)
     return change, mass, same
 
 
 @numba.njit(cache=True, nogil=True)
-def _compare(
-    offsets_a: Any,
-    sequence_a: Any,
-    slice_a: Any,
-    mass_a: Any,
-    mean_a: Any,
-    variance_a: Any,
-    images_a: Any,
-    mirrors_a: Any,
-    surfaces_a: Any,
-    offsets_b: Any,
-    sequence_b: Any,
-    slice_b: Any,
-    mass_b: Any,
-    mean_b: Any,
-    variance_b: Any,
-    images_b: Any,
-    mirrors_b: Any,
-    surfaces_b: Any,
-    same_course: Any,
-) -> Any:
-    num_rays = len(offsets_b) - 1
+def _compare(a: Any, b: Any, same_course: Any) -> Any:
+    """Compare the rays of two traces piece by piece; see :func:`ray_changes`."""
+    num_rays = len(b.offsets) - 1
     change = np.zeros(num_rays)
     mass = np.zeros(num_rays)
     same = np.ones(num_rays, np.bool_)
     # Sequences that the fit gathers in one scene and not in the other: facets of a surface that has become another.
-    partner_a, partner_b = np.full(len(images_a), -1), np.full(len(images_b), -1)
-    torn = np.zeros(len(images_b), np.bool_)
+    partner_a, partner_b = np.full(len(a.images), -1), np.full(len(b.images), -1)
+    torn = np.zeros(len(b.images), np.bool_)
     for ray in range(num_rays):
-        i, stop_i = offsets_a[ray], offsets_a[ray + 1]
-        j, stop_j = offsets_b[ray], offsets_b[ray + 1]
+        i, stop_i = a.offsets[ray], a.offsets[ray + 1]
+        j, stop_j = b.offsets[ray], b.offsets[ray + 1]
         while i < stop_i or j < stop_j:
             # The next straight stretch of the ray in either trace.
             end_i, end_j = i, j
-            while end_i < stop_i and sequence_a[end_i] == sequence_a[i]:
+            while end_i < stop_i and a.sequence[end_i] == a.sequence[i]:
                 end_i += 1
-            while end_j < stop_j and sequence_b[end_j] == sequence_b[j]:
+            while end_j < stop_j and b.sequence[end_j] == b.sequence[j]:
                 end_j += 1
             apart = np.inf
             if i < end_i and j < end_j:
                 apart = _distance(
-                    images_a[sequence_a[i]], mirrors_a[sequence_a[i]], images_b[sequence_b[j]], mirrors_b[sequence_b[j]]
+                    a.images[a.sequence[i]], a.mirrors[a.sequence[i]], b.images[b.sequence[j]], b.mirrors[b.sequence[j]]
                 )
             if apart != 0.0:
                 same[ray] = False
             else:
-                whole_a, whole_b = surfaces_a[sequence_a[i]], surfaces_b[sequence_b[j]]
+                whole_a, whole_b = a.surfaces[a.sequence[i]], b.surfaces[b.sequence[j]]
                 if partner_a[whole_a] < 0 and partner_b[whole_b] < 0:
                     partner_a[whole_a], partner_b[whole_b] = whole_b, whole_a
                 elif partner_a[whole_a] != whole_b:
@@ -173,31 +164,31 @@ def _compare(
                     if partner_a[whole_a] >= 0:
                         torn[partner_a[whole_a]] = True
             while i < end_i or j < end_j:
-                if apart <= same_course and i < end_i and j < end_j and slice_a[i] == slice_b[j]:
-                    change[ray] += abs(mass_a[i] - mass_b[j])
-                    mass[ray] += mass_b[j]
-                    moved = abs(mean_a[i] - mean_b[j])
+                if apart <= same_course and i < end_i and j < end_j and a.slice[i] == b.slice[j]:
+                    change[ray] += abs(a.mass[i] - b.mass[j])
+                    mass[ray] += b.mass[j]
+                    moved = abs(a.mean[i] - b.mean[j])
                     if moved > 0.0:
                         # The L1 distance of two normal densities is below their distance in standard deviations.
-                        deviation = np.sqrt(max(variance_a[i], variance_b[j]))
-                        change[ray] += min(mass_a[i], mass_b[j]) * (min(2.0, moved / deviation) if deviation else 2.0)
-                    if mass_a[i] != mass_b[j] or moved > 0.0 or variance_a[i] != variance_b[j]:
+                        deviation = np.sqrt(max(a.variance[i], b.variance[j]))
+                        change[ray] += min(a.mass[i], b.mass[j]) * (min(2.0, moved / deviation) if deviation else 2.0)
+                    if a.mass[i] != b.mass[j] or moved > 0.0 or a.variance[i] != b.variance[j]:
                         same[ray] = False
                     i += 1
                     j += 1
-                elif j == end_j or (i < end_i and slice_a[i] < slice_b[j]):
-                    change[ray] += mass_a[i]
+                elif j == end_j or (i < end_i and a.slice[i] < b.slice[j]):
+                    change[ray] += a.mass[i]
                     same[ray] = False
                     i += 1
                 else:
-                    change[ray] += mass_b[j]
-                    mass[ray] += mass_b[j]
+                    change[ray] += b.mass[j]
+                    mass[ray] += b.mass[j]
                     same[ray] = False
                     j += 1
     if torn.any():
         for ray in range(num_rays):
-            for piece in range(offsets_b[ray], offsets_b[ray + 1]):
-                if torn[surfaces_b[sequence_b[piece]]]:
+            for piece in range(b.offsets[ray], b.offsets[ray + 1]):
+                if torn[b.surfaces[b.sequence[piece]]]:
                     same[ray] = False
     return change, mass, same
 

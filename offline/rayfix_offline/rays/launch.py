@@ -5,8 +5,7 @@ where ``image`` is the station mirrored at the sequence's planes and ``mirror`` 
 hit comes from one division, however many reflections went before, and nothing accumulates.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -57,6 +56,7 @@ def launch(
     end = np.zeros(sequence.shape)
     log_gain = np.zeros(sequence.shape)
     sequence[:, 0] = 0
+    mirrors = _Mirrors(planes.face_planes, planes.normals, plane_offsets)
     direct = np.array([-1], np.int32)
     generations = [_Generation(parents=direct, planes=direct, images=station[None, :], mirrors=np.eye(3)[None])]
 
@@ -69,32 +69,20 @@ def launch(
         count = len(rays)
         faces = engine.first_hit(origins, headings)
         children = _Generation.of_at_most(count if depth < max_reflections else 0)
-        cosines = np.empty(count)
+        front = _Front(faces, rays, np.empty(count), origins, headings)
         num_on, num_children, num_lost = _reflect(
             depth,
-            faces,
-            rays,
             directions,
-            planes.face_planes,
-            planes.normals,
-            plane_offsets,
+            mirrors,
             bounds,
             offset,
             max_path_length,
             first,
-            generations[-1].images,
-            generations[-1].mirrors,
-            children.parents,
-            children.planes,
-            children.images,
-            children.mirrors,
+            generations[-1],
+            children,
             np.full(1 << (2 * max(1, len(children.parents))).bit_length(), -1, np.int32),
-            sequence,
-            start,
-            end,
-            cosines,
-            origins,
-            headings,
+            _Columns(sequence, start, end),
+            front,
         )
         lost += num_lost
         if depth == max_reflections:
@@ -102,7 +90,7 @@ def launch(
         first += len(generations[-1].parents)
         generations.append(children.shortened(num_children))
         rays, origins, headings = rays[:num_on], origins[:num_on], headings[:num_on]
-        loss = reflectivity.log_gain(faces[:num_on], cosines[:num_on])
+        loss = reflectivity.log_gain(faces[:num_on], front.cosines[:num_on])
         log_gain[rays, depth + 1] = log_gain[rays, depth] + loss
     return Segments(
         sequence=sequence,
@@ -122,8 +110,45 @@ def launch(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Generation:
+class _Mirrors(NamedTuple):
+    """Mirror planes as the kernel reads them; fields as in :class:`~rayfix_offline.twin.planes.Planes`."""
+
+    face_planes: NDArray[np.int32]
+    normals: NDArray[np.float64]
+    offsets: NDArray[np.float64]
+
+
+class _Columns(NamedTuple):
+    """What becomes :class:`Segments`."""
+
+    sequence: NDArray[np.int32]
+    start: NDArray[np.float64]
+    end: NDArray[np.float64]
+
+
+class _Front(NamedTuple):
+    """Rays that are still on their way.
+
+    Attributes
+    ----------
+    faces : ndarray of int32, shape (n,)
+        Triangle that each ray hits, -1 for none.
+    rays : ndarray of int64, shape (n,)
+        Rows of the directions and of :class:`_Columns`.
+    cosines : ndarray of shape (n,)
+        Cosine of the angle of incidence.
+    origins, headings : ndarray of float32, shape (n, 3)
+        Where and in which direction each ray goes on.
+    """
+
+    faces: NDArray[np.int32]
+    rays: NDArray[np.int64]
+    cosines: NDArray[np.float64]
+    origins: NDArray[np.float32]
+    headings: NDArray[np.float32]
+
+
+class _Generation(NamedTuple):
     """Sequences of one number of reflections; fields as in :class:`Sequences`."""
 
     parents: NDArray[np.int32]
@@ -154,52 +179,46 @@ class _Generation:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _reflect(
     depth: Any,
-    faces: Any,
-    rays: Any,
     directions: Any,
-    face_planes: Any,
-    normals: Any,
-    offsets: Any,
+    planes: Any,
     bounds: Any,
     offset: Any,
     max_path_length: Any,
     first: Any,
-    images: Any,
-    mirrors: Any,
-    child_parents: Any,
-    child_planes: Any,
-    child_images: Any,
-    child_mirrors: Any,
+    parents: Any,
+    children: Any,
     table: Any,
-    sequence: Any,
-    start: Any,
-    end: Any,
-    cosines: Any,
-    origins: Any,
-    headings: Any,
+    columns: Any,
+    front: Any,
 ) -> Any:
     """End the rays' pieces of one depth at what they hit, and mirror them there.
 
-    The rays that go on are moved to the front of ``faces``, ``rays``, ``cosines``, ``origins`` and ``headings``.
+    The rays that go on are moved to the front of the arrays of ``front``.
 
     Parameters
     ----------
-    faces : ndarray of int32, shape (n,)
-        What each ray hits, -1 for nothing.
-    rays : ndarray of int64, shape (n,)
-        Rows of ``directions``, ``sequence``, ``start`` and ``end``.
+    planes : _Mirrors
     first : int
-        Number of the first sequence in ``images`` and ``mirrors``; their children follow on these.
-    child_parents, child_planes, child_images, child_mirrors : ndarray
+        Number of the first of ``parents``; their children follow on these.
+    parents : _Generation
+    children : _Generation
         Room for the children; none when there are no more reflections.
     table : ndarray of int32, all -1
         Room for a hash table of the children; its length is a power of two, larger than their number.
+    columns : _Columns
+    front : _Front
 
     Returns
     -------
     num_on, num_children, num_lost : int
         Rays that go on, sequences found, and rays that hit nothing.
     """
+    face_planes, normals, offsets = planes.face_planes, planes.normals, planes.offsets
+    images, mirrors = parents.images, parents.mirrors
+    child_parents, child_planes = children.parents, children.planes
+    child_images, child_mirrors = children.images, children.mirrors
+    sequence, start, end = columns.sequence, columns.start, columns.end
+    faces, rays, cosines, origins, headings = front.faces, front.rays, front.cosines, front.origins, front.headings
     num_on, num_children, num_lost = 0, 0, 0
     next_first = first + len(images)
     last = len(child_parents) == 0

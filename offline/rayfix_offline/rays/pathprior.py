@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from rayfix_offline.rays.launch import turned
 from rayfix_offline.rays.rays import RaySet
-from rayfix_offline.rays.segments import Segments
-from rayfix_offline.rays.voxelwalk import GAUSS, new_crossings, over_ray_ranges, power, walk
+from rayfix_offline.rays.segments import SegmentArrays, Segments
+from rayfix_offline.rays.voxelwalk import GAUSS, VoxelWalk, over_ray_ranges, power, walk
 from rayfix_tables.freespace import FreeSpace
 
 
@@ -72,19 +72,10 @@ def fill_path_prior(
         total = np.zeros(tuple(shape))
         first_reached = np.full(total.shape, depths, np.int8)
         _fill(
-            segments.sequence[first:stop],
-            segments.start[first:stop],
-            segments.end[first:stop],
-            segments.sequences.images,
-            segments.sequences.mirrors,
-            rays.directions[first:stop],
+            SegmentArrays.of(segments, rays.directions, factors, first, stop),
             rays.solid_angle[first:stop],
-            factors[first:stop],
             exponent,
-            free_space.origin,
-            voxel_size,
-            total.shape,
-            *new_crossings(total.shape),
+            VoxelWalk.of(free_space.origin, voxel_size, total.shape),
             total.reshape(-1),
             first_reached.reshape(-1),
         )
@@ -102,35 +93,27 @@ def fill_path_prior(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _fill(
-    sequence: Any,
-    start: Any,
-    end: Any,
-    images: Any,
-    mirrors: Any,
-    directions: Any,
-    solid_angle: Any,
-    factors: Any,
-    exponent: Any,
-    origin: Any,
-    voxel: Any,
-    shape: Any,
-    lengths: Any,
-    voxels: Any,
-    total: Any,
-    reached: Any,
-) -> None:
-    """Add the integral of solid angle x length^2 x gain^beta to each voxel."""
-    for ray in range(sequence.shape[0]):
-        for depth in range(sequence.shape[1]):
-            seq = sequence[ray, depth]
+def _fill(rays: Any, solid_angle: Any, exponent: Any, room: Any, total: Any, reached: Any) -> None:
+    """Add the integral of solid angle x length^2 x gain^beta to each voxel.
+
+    Parameters
+    ----------
+    rays : SegmentArrays
+    room : VoxelWalk
+        Of the map.
+    total, reached : ndarray of shape (n_voxels,)
+        Changed in place: the integrals, and the smallest number of reflections by which a voxel is reached.
+    """
+    voxel, lengths, voxels = room.voxel_size, room.lengths, room.voxels
+    for ray in range(rays.sequence.shape[0]):
+        for depth in range(rays.sequence.shape[1]):
+            seq = rays.sequence[ray, depth]
             if seq < 0:
                 break
-            heading = turned(mirrors, seq, directions, ray)
-            scale = solid_angle[ray] * factors[ray, depth]
-            num_parts = walk(
-                images[seq], heading, start[ray, depth], end[ray, depth], origin, voxel, shape, lengths, voxels
-            )
+            heading = turned(rays.mirrors, seq, rays.directions, ray)
+            scale = solid_angle[ray] * rays.factors[ray, depth]
+            begin, stop = rays.start[ray, depth], rays.end[ray, depth]
+            num_parts = walk(rays.images[seq], heading, begin, stop, room.origin, voxel, room.shape, lengths, voxels)
             for part in range(num_parts):
                 place, begin = voxels[part], lengths[part]
                 size = lengths[part + 1] - begin

@@ -9,7 +9,7 @@ A piece is shared by all cells of all levels whose window the ray lies in.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numba
 import numpy as np
@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from rayfix_offline.rays.launch import turned
 from rayfix_offline.rays.pathprior import PathPrior, reflection_factors
 from rayfix_offline.rays.rays import RaySet
-from rayfix_offline.rays.segments import Segments
+from rayfix_offline.rays.segments import SegmentArrays, Segments
 from rayfix_offline.rays.settings import RaySettings
-from rayfix_offline.rays.voxelwalk import GAUSS, new_crossings, over_ray_ranges, power, walk
+from rayfix_offline.rays.voxelwalk import GAUSS, VoxelWalk, over_ray_ranges, power, walk
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +65,16 @@ class Pieces:
         )
 
 
+class _PieceArrays(NamedTuple):
+    """Columns of :class:`Pieces`, as the kernels fill them."""
+
+    sequence: NDArray[np.int32]
+    slice: NDArray[np.int16]
+    mass: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+
 def cut_pieces(
     rays: RaySet,
     segments: Segments,
@@ -107,28 +117,15 @@ def cut_pieces(
 
     def cut(first: int, stop: int) -> None:
         _cut(
-            segments.sequence[first:stop],
-            segments.start[first:stop],
-            segments.end[first:stop],
-            segments.sequences.images,
-            segments.sequences.mirrors,
-            rays.directions[first:stop],
-            factors[first:stop],
+            SegmentArrays.of(segments, rays.directions, factors, first, stop),
             exponent,
             kind != "paper",
             kind == "power",
-            prior.origin,
-            prior.voxel_size,
-            prior.total.shape,
+            VoxelWalk.of(prior.origin, prior.voxel_size, prior.total.shape),
             prior.total.reshape(-1),
-            *new_crossings(prior.total.shape),
             nodes,
             offsets[first:stop],
-            pieces.sequence,
-            pieces.slice,
-            pieces.mass,
-            pieces.mean,
-            pieces.variance,
+            _PieceArrays(pieces.sequence, pieces.slice, pieces.mass, pieces.mean, pieces.variance),
         )
 
     over_ray_ranges(cut, len(rays), jobs)
@@ -167,45 +164,50 @@ def _count(sequence: Any, start: Any, end: Any, nodes: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _cut(
-    sequence: Any,
-    start: Any,
-    end: Any,
-    images: Any,
-    mirrors: Any,
-    directions: Any,
-    factors: Any,
+    rays: Any,
     exponent: Any,
     by_volume: Any,
     by_gain: Any,
-    origin: Any,
-    voxel: Any,
-    shape: Any,
+    room: Any,
     total: Any,
-    lengths: Any,
-    voxels: Any,
     nodes: Any,
     offsets: Any,
-    out_sequence: Any,
-    out_slice: Any,
-    out_mass: Any,
-    out_mean: Any,
-    out_variance: Any,
+    out: Any,
 ) -> None:
-    for ray in range(sequence.shape[0]):
+    """Cut rays into pieces.
+
+    Parameters
+    ----------
+    rays : SegmentArrays
+    by_volume, by_gain : bool
+        Whether the weight along a ray has the factor s^2, and the path's probability.
+    room : VoxelWalk
+        Of the prior's map.
+    total : ndarray of shape (n_voxels,)
+        The prior's map.
+    offsets : ndarray of int64, shape (n_rays,)
+        First piece of each ray.
+    out : _PieceArrays
+        Of all rays; filled in place.
+    """
+    lengths, voxels = room.lengths, room.voxels
+    for ray in range(rays.sequence.shape[0]):
         at = offsets[ray]
         last = 0
-        for depth in range(sequence.shape[1]):
-            seq = sequence[ray, depth]
+        for depth in range(rays.sequence.shape[1]):
+            seq = rays.sequence[ray, depth]
             if seq < 0:
                 break
-            begin, stop = start[ray, depth], end[ray, depth]
+            begin, stop = rays.start[ray, depth], rays.end[ray, depth]
             first = max(0, _last_slice(begin, nodes, last) - 1)
             last = _last_slice(stop, nodes, first)
             for n in range(first, last + 1):
-                out_sequence[at + n - first] = seq
-                out_slice[at + n - first] = n
-            heading = turned(mirrors, seq, directions, ray)
-            num_parts = walk(images[seq], heading, begin, stop, origin, voxel, shape, lengths, voxels)
+                out.sequence[at + n - first] = seq
+                out.slice[at + n - first] = n
+            heading = turned(rays.mirrors, seq, rays.directions, ray)
+            num_parts = walk(
+                rays.images[seq], heading, begin, stop, room.origin, room.voxel_size, room.shape, lengths, voxels
+            )
             peak = _last_slice(begin, nodes, first)  # the slice that rises where the walk is
             low = nodes[peak - 1] if peak > 0 else 0.0
             sum0, sum1, sum2, sum3 = 0.0, 0.0, 0.0, 0.0  # moments about the last node, before the hats
@@ -214,8 +216,8 @@ def _cut(
                 # The path's probability, times length^(2 beta) and before it is capped to 1. A path so weak that its
                 # gain^beta is 0 is never reported, and outside of the map there is no place to be.
                 probability = 0.0
-                if voxels[part] >= 0 and factors[ray, depth] > 0.0:
-                    probability = factors[ray, depth] / total[voxels[part]]  # infinite where the map is 0
+                if voxels[part] >= 0 and rays.factors[ray, depth] > 0.0:
+                    probability = rays.factors[ray, depth] / total[voxels[part]]  # infinite where the map is 0
                 while length < lengths[part + 1]:
                     reach = min(lengths[part + 1], nodes[peak])
                     for share, portion in GAUSS:
@@ -230,50 +232,38 @@ def _cut(
                         sum3 += weight * above * above * above
                     length = reach
                     if length == nodes[peak] or length == stop:
-                        _share_out(
-                            peak, nodes, sum0, sum1, sum2, sum3, at + peak - first, out_mass, out_mean, out_variance
-                        )
+                        _share_out(peak, nodes, (sum0, sum1, sum2, sum3), at + peak - first, out)
                         sum0, sum1, sum2, sum3 = 0.0, 0.0, 0.0, 0.0
                         low = nodes[peak]
                         peak += 1
             for n in range(first, last + 1):
                 i = at + n - first
-                if out_mass[i] > 0.0:
-                    off = out_mean[i] / out_mass[i]
-                    out_mean[i] = nodes[n] + off
-                    out_variance[i] = max(0.0, out_variance[i] / out_mass[i] - off * off)
+                if out.mass[i] > 0.0:
+                    off = out.mean[i] / out.mass[i]
+                    out.mean[i] = nodes[n] + off
+                    out.variance[i] = max(0.0, out.variance[i] / out.mass[i] - off * off)
             at += last - first + 1
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _share_out(
-    peak: Any,
-    nodes: Any,
-    sum0: Any,
-    sum1: Any,
-    sum2: Any,
-    sum3: Any,
-    i: Any,
-    out_mass: Any,
-    out_mean: Any,
-    out_variance: Any,
-) -> None:
+def _share_out(peak: Any, nodes: Any, sums: Any, i: Any, out: Any) -> None:
     """Share what lies between two nodes between the slice that rises there, piece i, and the one that falls.
 
     The sums are moments about the lower node; those of each piece are taken about its own node.
     """
+    sum0, sum1, sum2, sum3 = sums
     if peak == 0:
         # The first slice takes all before its node.
         node = nodes[0]
-        out_mass[i] += sum0
-        out_mean[i] += sum1 - node * sum0
-        out_variance[i] += sum2 - 2.0 * node * sum1 + node * node * sum0
+        out.mass[i] += sum0
+        out.mean[i] += sum1 - node * sum0
+        out.variance[i] += sum2 - 2.0 * node * sum1 + node * node * sum0
         return
     width = nodes[peak] - nodes[peak - 1]
     rising0, rising1, rising2 = sum1 / width, sum2 / width, sum3 / width
-    out_mass[i] += rising0
-    out_mean[i] += rising1 - width * rising0
-    out_variance[i] += rising2 - 2.0 * width * rising1 + width * width * rising0
-    out_mass[i - 1] += sum0 - rising0
-    out_mean[i - 1] += sum1 - rising1
-    out_variance[i - 1] += sum2 - rising2
+    out.mass[i] += rising0
+    out.mean[i] += rising1 - width * rising0
+    out.variance[i] += rising2 - 2.0 * width * rising1 + width * width * rising0
+    out.mass[i - 1] += sum0 - rising0
+    out.mean[i - 1] += sum1 - rising1
+    out.variance[i - 1] += sum2 - rising2

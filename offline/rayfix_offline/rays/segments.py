@@ -1,6 +1,7 @@
 """Straight pieces of rays, and the reflection sequences that they belong to."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,3 +53,42 @@ class Segments:
     log_gain: NDArray[np.float64]
     sequences: Sequences
     lost_ray_share: float
+
+
+class SegmentArrays(NamedTuple):
+    """Straight pieces of some rays, as the kernels read them.
+
+    Attributes
+    ----------
+    sequence, start, end
+        As in :class:`Segments`.
+    images, mirrors
+        As in :class:`Sequences`.
+    directions : ndarray of shape (n_rays, 3)
+        In which the rays are launched.
+    factors : ndarray of shape (n_rays, max_reflections + 1)
+        What the reflections before a piece put on gain^beta.
+    """
+
+    sequence: NDArray[np.int32]
+    start: NDArray[np.float64]
+    end: NDArray[np.float64]
+    images: NDArray[np.float64]
+    mirrors: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    factors: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, segments: Segments, directions: NDArray[np.float64], factors: NDArray[np.float64], first: int, stop: int
+    ) -> "SegmentArrays":
+        """Pieces of the rays from ``first`` to before ``stop``."""
+        return cls(
+            sequence=segments.sequence[first:stop],
+            start=segments.start[first:stop],
+            end=segments.end[first:stop],
+            images=segments.sequences.images,
+            mirrors=segments.sequences.mirrors,
+            directions=directions[first:stop],
+            factors=factors[first:stop],
+        )

@@ -8,11 +8,12 @@ Gauss are exact for polynomials of degree five.
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from joblib import Parallel, delayed
+from numpy.typing import NDArray
 
 GAUSS = ((0.5 - 0.15**0.5, 5.0 / 18.0), (0.5, 8.0 / 18.0), (0.5 + 0.15**0.5, 5.0 / 18.0))
 """Gauss' three points: the share of the interval that lies before each, and that which it stands for."""
@@ -34,6 +35,32 @@ def over_ray_ranges(run: Callable[[int, int], Any], num_rays: int, jobs: int) ->
     edges = np.linspace(0, num_rays, RAY_RANGES + 1).astype(int).tolist()
     calls = (delayed(run)(first, stop) for first, stop in pairwise(edges))
     return list(Parallel(n_jobs=jobs, prefer="threads")(calls))
+
+
+class VoxelWalk(NamedTuple):
+    """A voxel map, and room for the crossings that :func:`walk` finds in it.
+
+    Attributes
+    ----------
+    origin : ndarray of shape (3,), m
+        Low corner of the map.
+    voxel_size : float, m
+    shape : tuple of 3 ints
+        Voxels along each axis.
+    lengths, voxels : ndarray
+        Room of :func:`new_crossings`.
+    """
+
+    origin: NDArray[np.float64]
+    voxel_size: float
+    shape: tuple[int, ...]
+    lengths: NDArray[np.float64]
+    voxels: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, origin: NDArray[np.float64], voxel_size: float, shape: tuple[int, ...]) -> "VoxelWalk":
+        """Walk of a map of a shape."""
+        return cls(origin, voxel_size, shape, *new_crossings(shape))
 
 
 def new_crossings(shape: tuple[int, ...]) -> tuple[Any, Any]:

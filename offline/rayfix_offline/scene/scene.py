@@ -43,6 +43,9 @@ UPRIGHT = {
 
 _MIN_AREA = 1e-12
 
+_MOST_MATERIALS = int(np.iinfo(np.int16).max) + 1
+"""Indices of materials have two bytes in a table."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
@@ -134,7 +137,7 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
             f"{path} has {num_triangles:,} triangles, more than {MOST_TRIANGLES:,}; leave out what is small"
         )
     _refuse_far(path, objects, scale)
-    scene = _gather(objects, contents, scale=scale, up=contents.up or up)
+    scene = _gather(path, objects, contents, scale=scale, up=contents.up or up)
     if not len(scene.faces):
         raise SceneError(f"{path} has only triangles without an area; export the scene again")
     return scene
@@ -157,7 +160,7 @@ def _points(placed: Placed) -> NDArray[np.float64]:
     return placed.vertices @ placed.transform[:3, :3].T + placed.transform[:3, 3]
 
 
-def _gather(objects: list[Placed], contents: Contents, *, scale: float, up: str) -> Scene:
+def _gather(path: Path, objects: list[Placed], contents: Contents, *, scale: float, up: str) -> Scene:
     turn = UPRIGHT[up]
     vertices, faces, face_materials, face_objects = [], [], [], []
     numbers: dict[str, int] = {}
@@ -173,6 +176,11 @@ def _gather(objects: list[Placed], contents: Contents, *, scale: float, up: str)
             table[number] = numbers.setdefault(each.materials[number], len(numbers))
         face_materials.append(table[each.face_materials])
         face_objects.append(np.full(len(each.faces), index))
+    if len(numbers) > _MOST_MATERIALS:
+        raise SceneError(
+            f"{path} has {len(numbers):,} materials, a table holds {_MOST_MATERIALS:,} at most; give objects of one "
+            "building material the same material"
+        )
     all_vertices = np.concatenate(vertices)
     all_faces = np.concatenate(faces)
     a, b, c = (all_vertices[all_faces[:, i]] for i in range(3))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rayfix_offline.fit.moments import (
     blur,
     gather_groups,
-    gathered_arrays,
+    gathered_rays,
     new_rows,
 )
 from rayfix_offline.fit.settings import RayFit
@@ -54,7 +54,7 @@ def gather(traced: Traced, centre: tuple[float, float], window: float, rows: NDA
         *centre,
         window,
         RayFit.cutoff,
-        *gathered_arrays(rays, pieces, traced.sequences),
+        gathered_rays(rays, pieces, traced.sequences),
         pieces.num_slices,
         new_rows(len(traced.sequences.images)) if rows is None else rows,
     )

@@ -324,3 +324,22 @@ def test_the_checksum_finds_a_change(
     before = scene.sha256
     change(scene)
     assert scene.sha256 != before
+
+
+@pytest.mark.parametrize("count", [32_768, 32_769])
+def test_more_materials_than_a_table_holds(count: int, tmp_path: Path) -> None:
+    """Beyond index 32,767 they wrapped: such triangles got another material, or none."""
+    lines = ["v 0 0 0", "v 1 0 0", "v 0 1 0"]
+    for n in range(count):
+        lines += [f"o part{n}", f"usemtl m{n}", "f 1 2 3"]
+    (tmp_path / "a.obj").write_text("\n".join(["mtllib a.mtl", *lines]) + "\n", encoding="utf-8")
+    (tmp_path / "a.mtl").write_text("".join(f"newmtl m{n}\nKd 1 1 1\n" for n in range(count)), encoding="utf-8")
+    if count > 32_768:
+        assert re.search(
+            r"a\.obj has 32,769 materials, a table holds 32,768 at most; give", refused(tmp_path / "a.obj")
+        )
+        return
+    scene = load_scene(tmp_path / "a.obj")
+    assert len(scene.materials) == count
+    assert scene.face_materials.max() == count - 1
+    assert scene.face_materials.min() == 0
