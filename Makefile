@@ -93,7 +93,7 @@ images: $(VENV)/.done viewer
 	$(BIN)/python docker/test_images.py
 
 accuracy: $(VENV)/.done
-	$(BIN)/python benchmarks/accuracy.py
+	$(BIN)/python -m benchmarks.fusion.accuracy
 
 openapi: $(VENV)/.done
 	$(BIN)/python -m rayfix_service.server.openapi > docs/openapi.json

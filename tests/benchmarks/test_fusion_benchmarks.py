@@ -23,7 +23,7 @@ def test_calibration(
     hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arguments = ["--table", str(hall_table_path), "--drops", "8", "--select", "random"]
-    lines = run("calibration.py", capsys, monkeypatch, *arguments)
+    lines = run("fusion/calibration.py", capsys, monkeypatch, *arguments)
     rows = [line.split() for line in lines[3:]]
     assert [(row[1], float(row[0])) for row in rows] == [
         (timing, deviation) for timing in ("none", "pt", "tdoa") for deviation in (0.25, 1.0, 5.0)
@@ -37,7 +37,7 @@ def test_calibration(
 
 @pytest.mark.slow
 def test_stress(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = run("stress.py", capsys, monkeypatch, "--table", str(hall_table_path), "--drops", "12")
+    lines = run("fusion/stress.py", capsys, monkeypatch, "--table", str(hall_table_path), "--drops", "12")
     assert [line[:28].strip() for line in lines if line.startswith(("random", "PT +", "ToA +"))] == [
         "random angle, no times",
         "random angle, PT",
@@ -54,7 +54,7 @@ def test_stress(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monke
 @pytest.mark.slow
 def test_fusion(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = ["--table", str(hall_table_path), "--reports", "3", "--paper-reports", "1"]
-    lines = run("fusion.py", capsys, monkeypatch, *arguments)
+    lines = run("fusion/fix_time.py", capsys, monkeypatch, *arguments)
     rows = lines[3:]
     assert [row[:12].strip() for row in rows] == ["AoA + PT", "AoA + ToA", "AoA + TDoA", "AoA", "PT", "TDoA"]
     for row in rows:
@@ -65,7 +65,7 @@ def test_fusion(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monke
 @pytest.mark.slow
 def test_exhaustive(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = ["--table", str(hall_table_path), "--reports", "33", "--products", "500"]
-    rows = [line.rsplit(maxsplit=9) for line in run("exhaustive.py", capsys, monkeypatch, *arguments)[4:]]
+    rows = [line.rsplit(maxsplit=9) for line in run("fusion/exhaustive.py", capsys, monkeypatch, *arguments)[4:]]
     assert len({label for label, *_ in rows}) == len(rows) == 11
     for _, *figures in rows:
         for half, most in zip(figures[::3], figures[2::3], strict=True):
@@ -81,7 +81,7 @@ def test_uwb(
     # The default beam loses fixes from ranges alone when one of them is wrong.
     arguments = ["--data", str(shared_data / "uwb"), "--reports", "3", "--windows", "15", "--beam", "1024"]
     arguments += ["--plot", str(picture)]
-    lines = run("uwb.py", capsys, monkeypatch, *arguments)
+    lines = run("fusion/uwb.py", capsys, monkeypatch, *arguments)
     rows = {line[:39].strip(): [float(v) for v in line[39:].split()[:6]] for line in lines[3:]}
     assert list(rows) == [
         "least squares",
@@ -101,7 +101,7 @@ def test_uwb(
 @pytest.mark.slow
 def test_tracking(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = ["--table", str(hall_table_path), "--walks", "2", "--reports", "12"]
-    lines = run("tracking.py", capsys, monkeypatch, *arguments)
+    lines = run("fusion/tracking.py", capsys, monkeypatch, *arguments)
     rows = lines[3:]
     assert len(rows) == 14
     for fix, track in zip(rows[::2], rows[1::2], strict=True):
@@ -120,7 +120,7 @@ def test_mqtt(hall_table_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     if shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin:/usr/bin") is None:
         pytest.skip("the MQTT broker mosquitto is not installed (Debian: apt-get install mosquitto)")
     arguments = ["--table", str(hall_table_path), "--seconds", "1.5", "--track"]
-    sent, received, *latencies, _ = run("mqtt.py", capsys, monkeypatch, *arguments)
+    sent, received, *latencies, _ = run("service/mqtt.py", capsys, monkeypatch, *arguments)
     assert sent.startswith("1 tags at 40 Hz:")
     assert " 60 packets in " in sent
     assert received == "60 positions, 0 packets without"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.sionna_rt import NOTHING_COMPARED, FoundPaths, compare, shortest_segment, sionna_paths
+from benchmarks.truth.sionna_rt import NOTHING_COMPARED, FoundPaths, compare, shortest_segment, sionna_paths
 from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_tables.angles import direction
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.walks import Errors, walk
+from benchmarks.common.walks import Errors, walk
 from rayfix_evaluation.drops.accuracy import clear_of_solids
 from rayfix_service.tracking.walls import walls_of
 from rayfix_tables.table import Table

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.costly_reports import random_measurement, random_report
+from benchmarks.common.costly_reports import random_measurement, random_report
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Height, Report
 from rayfix_service.fusion.posterior.fix import Fix

@@ -12,7 +12,7 @@ import httpx
 import numpy as np
 import pytest
 
-from benchmarks.costly_reports import climb, random_report
+from benchmarks.common.costly_reports import climb, random_report
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import (
     HEAVY_TAILED,

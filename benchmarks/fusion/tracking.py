@@ -8,14 +8,14 @@ from time import perf_counter
 import numpy as np
 from scipy.stats import chi2
 
-from example_table import open_or_build, table_parser
+from benchmarks.common.example_table import open_or_build, table_parser
+from benchmarks.common.walks import Errors, follow_walks, walk
 from rayfix_evaluation.drops.accuracy import drops_at, solver_of
 from rayfix_evaluation.drops.simulate import Noise, Timing
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.tracking.motion import MotionModel
 from rayfix_service.tracking.settings import TrackingSettings
 from rayfix_service.tracking.tracker import Tracker
-from walks import Errors, follow_walks, walk
 
 HEAD = "                                                   error [m]           above   truth in the ellipsoid of   NEES"
 COLUMNS = "stations  angles  times             RMS      50 %     90 %     1 m      68 %     90 %     99 %      median"

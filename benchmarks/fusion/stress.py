@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from example_table import open_or_build, table_parser
+from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import Drop, drop_positions, drops_at, solver_of
 from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
 from rayfix_evaluation.drops.stress import (

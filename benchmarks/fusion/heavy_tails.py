@@ -13,7 +13,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from example_table import open_or_build, table_parser
+from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import Drop, drop_positions, drops_at, solver_of
 from rayfix_evaluation.drops.simulate import fold_direction, select_path
 from rayfix_service.fusion.locator import Locator

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import tomli_w
 
-WAREHOUSE_SCENE = Path(__file__).parents[2] / "shared" / "data" / "warehouse" / "warehouse_collision.ply"
+WAREHOUSE_SCENE = Path(__file__).parents[3] / "shared" / "data" / "warehouse" / "warehouse_collision.ply"
 
 WAREHOUSE_STATIONS = {
     "w1": (-4.5, -9.0, 4.5),

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fit_report import plot, tables, verdict
-from fit_settings import SETTINGS, Setting
-from held_out import REFERENCE_RATIO, log_densities, processor_seconds, trace_sliced
+from benchmarks.common.held_out import REFERENCE_RATIO, log_densities, processor_seconds, trace_sliced
+from benchmarks.common.warehouse import WAREHOUSE_SCENE, write_warehouse
+from benchmarks.offline.fit_report import plot, tables, verdict
+from benchmarks.offline.fit_settings import SETTINGS, Setting
 from rayfix.example.files import write_example
 from rayfix_offline.fit.em import fit_em, sample_points
 from rayfix_offline.fit.settings import TubeFit
@@ -27,7 +28,6 @@ from rayfix_offline.job.plan import BLOCK_CELLS
 from rayfix_offline.rays.trace import LevelRays, level_grid
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin.twin import Twin, prepare_twin
-from warehouse import WAREHOUSE_SCENE, write_warehouse
 
 HELD_OUT_POINTS = 1000
 

@@ -7,7 +7,7 @@ from collections import Counter
 
 import numpy as np
 
-from example_table import open_or_build, table_parser
+from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import drop_uniformly, locate_drops
 from rayfix_evaluation.drops.simulate import Noise, Timing
 from rayfix_service.fusion.locator import Locator

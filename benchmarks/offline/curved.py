@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from held_out import log_densities
+from benchmarks.common.held_out import log_densities
 from rayfix_offline.fit.em import sample_points
 from rayfix_offline.fit.join_surfaces import join_groups
 from rayfix_offline.fit.moments import gather_groups, gathered_rays, new_rows

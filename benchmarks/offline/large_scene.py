@@ -108,7 +108,17 @@ def measure(name: str, triangles: int) -> None:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         # In another process, so that the making of the scene does not count.
-        command = [sys.executable, __file__, "--write", place, "--scenes", name, "--triangles", str(triangles)]
+        command = [
+            sys.executable,
+            "-m",
+            "benchmarks.offline.large_scene",
+            "--write",
+            place,
+            "--scenes",
+            name,
+            "--triangles",
+            str(triangles),
+        ]
         subprocess.run(command, check=True)
         site_path = folder / "site.toml"
         site = read_site(site_path)
@@ -152,7 +162,15 @@ def main() -> None:
     print("| scene | triangles | planes | surfaces | load | prepare | check | build | tubes per cell |", flush=True)
     print("|---|---|---|---|---|---|---|---|---|", flush=True)
     for name in options.scenes:
-        command = [sys.executable, __file__, "--scenes", name, "--triangles", str(options.triangles)]
+        command = [
+            sys.executable,
+            "-m",
+            "benchmarks.offline.large_scene",
+            "--scenes",
+            name,
+            "--triangles",
+            str(options.triangles),
+        ]
         subprocess.run(command, check=True)
 
 

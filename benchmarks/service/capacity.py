@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from example_table import open_or_build, table_parser
+from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly
 from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
 from rayfix_service.fusion.locator import Locator

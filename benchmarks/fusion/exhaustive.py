@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from example_table import open_or_build, table_parser
+from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly
 from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
 from rayfix_service.fusion.measurements.observations import sort_report

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from example_table import open_or_build, table_parser
+from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.arrays.picture import draw_angle_errors
 from rayfix_evaluation.arrays.planar import PlanarArray, Signal
 from rayfix_evaluation.arrays.study import ArrayStudy, angle_errors, statistics_rows, study_statistics

@@ -21,7 +21,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from held_out import COMPONENT_BYTES
+from benchmarks.common.held_out import COMPONENT_BYTES
 from rayfix.example.files import write_example
 from rayfix_offline.fit.cells import assemble_level, fit_cells, widen_cells
 from rayfix_offline.fit.em import fit_em

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.truth.sionna_rt import NOTHING_COMPARED, compare, shortest_segment, sionna_paths
 from rayfix.example.hall import hall_scene, hall_stations
 from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_offline.scene.scene import load_scene
-from sionna_rt import NOTHING_COMPARED, compare, shortest_segment, sionna_paths
 
 _NO_LIMIT = 1e4  # m; Sionna RT knows no longest path
 _STATIONS = 4

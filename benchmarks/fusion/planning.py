@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from example_table import open_or_build, table_parser
+from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import drops_at, locate_drops, solver_of
 from rayfix_evaluation.drops.simulate import Noise, Timing
 from rayfix_evaluation.planning.forecast import PlanMap, PlanSettings, draw_places, forecast

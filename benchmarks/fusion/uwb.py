@@ -17,6 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmarks.fusion.uwb_recordings import ANCHORS, Ranging, least_squares, read_ranging, site_text
 from rayfix_evaluation.drops.calibration import ellipsoid_holds
 from rayfix_offline.build import build_table
 from rayfix_service.fusion.locator import Locator
@@ -24,7 +25,6 @@ from rayfix_service.fusion.measurements.report import Height, Range, Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_tables.table import Table
-from uwb_recordings import ANCHORS, Ranging, least_squares, read_ranging, site_text
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ CALIBRATION, HELD_OUT = (0.0, 0.25), (0.3, 1.0)  # shares of the run
 DETOUR = 3.0  # m
 HEIGHT_STDEV = 0.02  # m, where the height is known
 VARIANTS = (("", "sound"), (", one wrong", "spoilt"))
-FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "uwb"
+FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data" / "uwb"
 
 
 def main() -> None:

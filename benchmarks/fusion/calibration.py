@@ -9,7 +9,7 @@ from typing import get_args
 
 import numpy as np
 
-from example_table import open_or_build, table_parser
+from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly, locate_drop
 from rayfix_evaluation.drops.calibration import calibrate, wilson_interval
 from rayfix_evaluation.drops.simulate import Noise, Rule, Timing

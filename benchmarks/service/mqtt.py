@@ -22,11 +22,11 @@ from typing import Any
 import aiomqtt
 import numpy as np
 
-from example_table import open_or_build, table_parser
+from benchmarks.common.example_table import open_or_build, table_parser
+from benchmarks.common.walks import walk
 from rayfix_evaluation.drops.accuracy import drops_at, solver_of
 from rayfix_evaluation.drops.simulate import select_path
 from rayfix_tables.table import Table
-from walks import walk
 
 STDEV_DEG = 2.0
 

@@ -6,8 +6,8 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
-from fit_settings import CANDIDATES, DEFAULT, SETTINGS, default_of
-from held_out import COMPONENT_BYTES
+from benchmarks.common.held_out import COMPONENT_BYTES
+from benchmarks.offline.fit_settings import CANDIDATES, DEFAULT, SETTINGS, default_of
 
 
 def tables(scores: list[dict[str, Any]]) -> list[str]:

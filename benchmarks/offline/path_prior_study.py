@@ -14,13 +14,13 @@ import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.common.warehouse import write_warehouse
 from rayfix.example.files import write_example
 from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_offline.rays.pathprior import PathPrior, fill_path_prior, reflection_factors
 from rayfix_offline.rays.trace import launch_rays
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin.twin import Twin, prepare_twin
-from warehouse import write_warehouse
 
 SPACINGS_DEG = (0.21, 0.42, 0.83, 1.67)
 """Spacings of the rays that fill the map."""

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from held_out import log_densities
+from benchmarks.common.held_out import log_densities
 from rayfix.example.files import SCENE_FILE, write_example
 from rayfix.example.hall import hall_scene
 from rayfix_evaluation.drops.accuracy import drop_uniformly

@@ -1,8 +1,8 @@
 """Requests per second of the service, beside a plain FastAPI endpoint that computes nothing, and its memory.
 
-    python benchmarks/http_load.py hall.h5 [--workers 1 2] [--seconds 5] [--rounds 3] [--swaps 20]
-    python benchmarks/http_load.py hall.h5 --memory 200000
-    python benchmarks/http_load.py hall.h5 --steady 15 [--rate 100]
+    python -m benchmarks.service.http_load hall.h5 [--workers 1 2] [--seconds 5] [--rounds 3] [--swaps 20]
+    python -m benchmarks.service.http_load hall.h5 --memory 200000
+    python -m benchmarks.service.http_load hall.h5 --steady 15 [--rate 100]
 
 The load comes from `wrk` (Debian package wrk) over 16 connections on loopback. Both servers are uvicorn, on uvloop
 and with httptools; the plain one is started by uvicorn's command, validates the same report with the same models and
@@ -39,6 +39,7 @@ from rayfix_service.wire import ReportDocument
 
 REPORT = REPORT_EXAMPLES["angle_and_time"]["value"]
 CONNECTIONS = 16
+ROOT = Path(__file__).resolve().parents[2]
 
 plain = FastAPI()
 
@@ -106,8 +107,8 @@ def rayfix_command(table: Path, workers: int) -> list[str]:
 
 def plain_command(workers: int) -> list[str]:
     """Command that serves the endpoint that computes nothing."""
-    options = ["--port", "0", "--workers", str(workers), "--no-access-log", "--app-dir", str(Path(__file__).parent)]
-    return [sys.executable, "-m", "uvicorn", f"{Path(__file__).stem}:plain", *options]
+    options = ["--port", "0", "--workers", str(workers), "--no-access-log", "--app-dir", str(ROOT)]
+    return [sys.executable, "-m", "uvicorn", "benchmarks.service.http_load:plain", *options]
 
 
 def processes(pid: int) -> Iterator[int]:

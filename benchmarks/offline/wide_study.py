@@ -17,8 +17,14 @@ import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
-from example_table import open_or_build, table_parser
-from held_out import COMPONENT_BYTES, REFERENCE_RATIO, log_density_as_measured, trace_sliced, trace_window
+from benchmarks.common.example_table import open_or_build, table_parser
+from benchmarks.common.held_out import (
+    COMPONENT_BYTES,
+    REFERENCE_RATIO,
+    log_density_as_measured,
+    trace_sliced,
+    trace_window,
+)
 from rayfix.example.files import write_example
 from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly, locate_drops
 from rayfix_evaluation.drops.simulate import Noise

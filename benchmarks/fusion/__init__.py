@@ -1,0 +1,1 @@
+"""Accuracy, calibration and time of fixes and tracks."""

@@ -1,0 +1,1 @@
+"""Fits, builds and updates: quality, time, memory and size."""

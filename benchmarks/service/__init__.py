@@ -1,0 +1,1 @@
+"""Load, capacity and streams of the running service."""

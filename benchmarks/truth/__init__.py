@@ -1,0 +1,1 @@
+"""The forward solver beside another one, and angle errors of antenna arrays."""
