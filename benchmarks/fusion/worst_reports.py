@@ -12,9 +12,9 @@ from collections import Counter
 from time import perf_counter, thread_time
 
 import numpy as np
-from example_table import open_or_build, table_parser
 
 from benchmarks.common.costly_reports import climb
+from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.stopping import FixStoppedError, Stop

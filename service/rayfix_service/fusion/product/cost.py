@@ -3,7 +3,7 @@
 What a fix takes follows from how many components of the table its measurements look up, how many combinations of errors
 each of these is taken with, and how many products there are to form. The counts below are at most what the fusion will
 meet, from figures of each station that are worked out once; the constants are fitted to measured times
-(``benchmarks/fusion/worst_reports.py``), on a core of its own. Whether a report is quick is all that is asked, so that wide
+(``benchmarks/fusion/worst_reports.py``), on a core of its own. Only whether a report is quick is asked, so that wide
 bounds will do: the estimate is some times too high for most reports, and hardly ever too low.
 """
 
