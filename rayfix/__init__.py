@@ -77,6 +77,8 @@ if TYPE_CHECKING:
     from rayfix_service.fusion.posterior.fix import Status as Status
     from rayfix_service.fusion.posterior.posterior import Posterior as Posterior
     from rayfix_service.fusion.settings import FusionSettings as FusionSettings
+    from rayfix_service.fusion.stopping import FixStoppedError as FixStoppedError
+    from rayfix_service.fusion.stopping import Stop as Stop
     from rayfix_service.http.errors import ServiceError as ServiceError
     from rayfix_service.measuring.impulse_response import range_from_impulse_response as range_from_impulse_response
     from rayfix_service.measuring.ranging import LogRangeEstimate as LogRangeEstimate
@@ -108,6 +110,7 @@ __all__ = [
     "ErrorModel",
     "Estimate",
     "Fix",
+    "FixStoppedError",
     "FormatVersionError",
     "Frame",
     "Fused",
@@ -137,6 +140,7 @@ __all__ = [
     "SettingsError",
     "SiteError",
     "Status",
+    "Stop",
     "Table",
     "TableError",
     "TimeDifference",
@@ -171,6 +175,7 @@ _LAZY = {
         "TimeOfArrival",
     ),
     ("rayfix_service.fusion.settings", "service"): ("FusionSettings",),
+    ("rayfix_service.fusion.stopping", "service"): ("FixStoppedError", "Stop"),
     ("rayfix_service.fusion.posterior.fix", "service"): ("Candidate", "Fix", "Outcome", "Status"),
     ("rayfix_service.fusion.posterior.credible", "service"): ("CredibleRegions",),
     ("rayfix_service.fusion.posterior.posterior", "service"): ("Posterior",),

@@ -46,8 +46,8 @@ def build(
     former : str or Path, optional
         Table from which whatever still holds is taken; one at ``table_path`` when left out.
     tolerance : float
-        Share of a cell's mass, 0 or more and below 1, that may have changed before a cell of the former table is fitted
-        again. With 0, the table is that of a whole build.
+        Fraction of a cell's mass, 0 or more and below 1, that may have changed before a cell of the former table is
+        fitted again. With 0, the table is that of a whole build.
 
     Raises
     ------
@@ -138,7 +138,7 @@ class Locator(_Locator):
         return super().posterior(_read(report), stop=stop)
 
     def fuse(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Fused:
-        """Fuse the measurements of a report and keep what its fix was made of, for :class:`Tracker`.
+        """Fuse the measurements of a report and keep its likelihood, for :class:`Tracker`.
 
         Parameters
         ----------
@@ -161,7 +161,7 @@ class Tracker(_Tracker):
     Parameters
     ----------
     table : Table
-        Whose walls no target passes.
+        Its walls block the motion of targets.
     settings : TrackingSettings, optional
     """
 

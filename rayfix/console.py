@@ -150,12 +150,12 @@ class _MemoryColumn(ProgressColumn):
 
 
 def print_check(check: "Check") -> None:
-    """Print a line per finding, one on the rays that are lost and one for the whole; a terminal gets them wrapped."""
+    """Print a line for each finding, one for the rays that leave the scene, and a summary; wrapped on a terminal."""
     lines = [f"{finding.severity}: {finding.message}" for finding in check.findings]
     twin = check.twin
     if check.escapes:
-        lost = ", ".join(f"{escapes.station_id} {escapes.share:.2%}" for escapes in check.escapes)
-        lines.append(f"rays that leave the scene: {lost}")
+        escaped = ", ".join(f"{escapes.station_id} {escapes.share:.2%}" for escapes in check.escapes)
+        lines.append(f"rays that leave the scene: {escaped}")
     size = " x ".join(f"{length:.6g}" for length in twin.scene.bounds[1] - twin.scene.bounds[0])
     curved = f" in {twin.planes.num_surfaces:,} surfaces" if twin.planes.curved else ""
     lines.append(
@@ -198,8 +198,8 @@ def print_build_summary(summary: "BuildSummary") -> None:
             *(f"{share:.0%}" for share in s.coverage),
         )
     grid.caption = (
-        "filled: cells that rays come to; tubes: components of their mixtures; lost: rays that left the scene; "
-        "<= k: share of the free space that at most k reflections reach"
+        "filled: cells with rays; tubes: components of their mixtures; lost: rays that left the scene; "
+        "<= k: fraction of the free space that is reached with at most k reflections"
     )
     console = Console()
     console.print(grid)

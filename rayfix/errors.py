@@ -2,7 +2,7 @@
 
 ::
 
-    RayfixError                     root; ``str(error)`` is one line that names the culprit and the remedy
+    RayfixError                     root; ``str(error)`` is one line that names the cause and the remedy
     ├── SiteError                   the site file: unreadable, unknown key, value out of range
     ├── SceneError                  the mesh: missing, unreadable, empty, a station where none can be
     ├── BuildError                  the offline job: no space left, no ray came back
@@ -14,6 +14,7 @@
     │   ├── MalformedJsonError      its JSON cannot be read
     │   ├── InvalidReportError      its JSON does not have the form of a report
     │   └── RefusedReportError      a service refused it; see below
+    ├── FixStoppedError             a fix that its caller has stopped
     ├── SettingsError               a setting out of its range; a ValueError
     ├── MissingExtraError           an optional dependency is not installed; an ImportError
     ├── ClientError                 between a client and the service
@@ -21,7 +22,7 @@
     │   ├── AnswerError             an answer that is not one of this service
     │   └── ProblemError            a problem document (RFC 9457): kind, status, errors
     │       └── RefusedReportError  that of a report
-    ├── ServiceError                ``rayfix serve`` cannot start as it is told to
+    ├── ServiceError                ``rayfix serve`` cannot start with its settings
     ├── BrokerError                 ``rayfix mqtt``: the MQTT broker
     ├── HubError                    the address of an omlox hub
     └── ViewError                   ``rayfix view``: the page cannot be written

@@ -1,4 +1,4 @@
-"""Locate reports that lie in a file."""
+"""Locate the reports of a file."""
 
 import time
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ def locate_file(
     stations: Mapping[str, str] | None = None,
     height: Height | None = None,
 ) -> list[dict[str, Any]]:
-    """Answer a file as the HTTP interface would: with one position, or for u-blox lines with as many as they tell of.
+    """Answer a file as the HTTP interface does: with one position, or with one for each epoch of u-blox lines.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def locate_file(
     stations : Mapping, optional
         Stations by the names that the file has for them; a native report has the table's own.
     height : Height, optional
-        What is known of the target's height, for reports that say nothing of it.
+        Prior of the target's height, for reports without one.
 
     Raises
     ------

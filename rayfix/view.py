@@ -50,11 +50,11 @@ def write_view(table_path: Path, output: Path, report_path: Path | None = None) 
         When the viewer is not built, or the page cannot be written.
     """
     if output.suffix.lower() not in _PAGES:
-        raise ViewError(f"{output} is no name of a page; end it in {_PAGES[0]}")
+        raise ViewError(f"{output} is not the name of a page; end it in {_PAGES[0]}")
     table = open_checked(table_path)
     locator = Locator(table)
     if report_path is not None:
-        locator.warm_up()  # else the first fix would tell how long compiling takes
+        locator.warm_up()  # else compute_ms of the first fix would include compilation
     events = [] if report_path is None else [_event(locator, document) for document in read_reports(report_path)]
     page = render_view(table_path.stem, table, events)
     try:

@@ -11,7 +11,7 @@ from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import drops_at, locate_drops, solver_of
 from rayfix_evaluation.drops.simulate import Noise, Timing
 from rayfix_evaluation.planning.forecast import PlanMap, PlanSettings, draw_places, forecast
-from rayfix_evaluation.planning.station_mixture import heard_paths
+from rayfix_evaluation.planning.station_mixture import audible_paths
 from rayfix_service.fusion.locator import Locator
 from rayfix_tables.angles import direction
 from rayfix_tables.table import Table
@@ -44,22 +44,22 @@ def compare_paths(table: Table, height: float, spacing: float, seed: int) -> Non
     solver = solver_of(table)
     right, strongest, some, off, apart = [], [], [], [], []
     for station in table.site.stations:
-        told = heard_paths(table.levels(station.id)[0], places)
+        predicted = audible_paths(table.levels(station.id)[0], places)
         of_station = solver.station(station.position)
         for n, place in enumerate(places):
             paths = of_station.paths(place)
-            right.append(bool(told.heard[n]) == (len(paths) > 0))
-            if told.heard[n] and len(paths):
-                cosine = direction(paths.azimuth, paths.zenith) @ direction(told.azimuth[n], told.zenith[n])
+            right.append(bool(predicted.audible[n]) == (len(paths) > 0))
+            if predicted.audible[n] and len(paths):
+                cosine = direction(paths.azimuth, paths.zenith) @ direction(predicted.azimuth[n], predicted.zenith[n])
                 angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-                same = (angle < 1.0) & (np.abs(paths.path_length - told.path_length[n]) < 0.3)
+                same = (angle < 1.0) & (np.abs(paths.path_length - predicted.path_length[n]) < 0.3)
                 strongest.append(same[0])
                 some.append(same.any())
                 if same[0]:
                     off.append(angle[0])
-                    apart.append(abs(paths.path_length[0] - told.path_length[n]))
+                    apart.append(abs(paths.path_length[0] - predicted.path_length[n]))
     print(
-        f"{len(places)} places and {len(table.site.stations)} stations at {height} m: whether heard is right for "
+        f"{len(places)} places and {len(table.site.stations)} stations at {height} m: whether audibility is right for "
         f"{np.mean(right):.0%}; the reported path is the strongest for {np.mean(strongest):.0%}, one that there is for "
         f"{np.mean(some):.0%}; off by {np.median(off):.3f} deg and {1e3 * np.median(apart):.1f} mm in the median"
     )
@@ -83,14 +83,14 @@ def compare_errors(table: Table, height: float, spacing: float, draws: int, seed
         found = locate_drops(locator, drops, noise, timing=timing, rng=np.random.default_rng([seed, 3]))
         error = matching(plan, squares.reshape(-1, draws, 3)[:, 0], found.error.reshape(-1, draws))
         known = np.isfinite(plan.error) & np.isfinite(error).all(axis=1)
-        measured, told = np.sqrt(np.square(error[known]).mean(axis=1)), plan.error[known]
-        tenth, middle, most = np.quantile(measured / told, [0.1, 0.5, 0.9])
-        whole = np.sqrt(np.square(measured).mean() / np.square(told).mean())
+        measured, predicted = np.sqrt(np.square(error[known]).mean(axis=1)), plan.error[known]
+        tenth, middle, most = np.quantile(measured / predicted, [0.1, 0.5, 0.9])
+        whole = np.sqrt(np.square(measured).mean() / np.square(predicted).mean())
         print(
             f"{degrees:5.2f}   {timing:5} {plan.within.mean():8.1%} {np.mean(error < 1.0):8.1%}"
-            f" {np.median(told):7.3f} {np.median(measured):7.3f}"
+            f" {np.median(predicted):7.3f} {np.median(measured):7.3f}"
             f" {whole:9.2f} {middle:8.2f} {tenth:8.2f} {most:8.2f}"
-            f" {spearmanr(measured, told).statistic:12.2f} {known.sum():10} of {len(plan)}",
+            f" {spearmanr(measured, predicted).statistic:12.2f} {known.sum():10} of {len(plan)}",
             flush=True,
         )
 

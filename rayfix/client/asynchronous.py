@@ -44,7 +44,7 @@ T = TypeVar("T")
 
 
 class AsyncClient:
-    """Asks a service for positions, for asyncio; the methods are those of :class:`~rayfix.client.Client`.
+    """Sends reports to a service, for asyncio; the methods are those of :class:`~rayfix.client.Client`.
 
     Parameters
     ----------
@@ -53,12 +53,12 @@ class AsyncClient:
     api_key, table, track, timeout, retries
         As in :class:`~rayfix.client.settings.ClientSettings`.
     transport : httpx.AsyncBaseTransport, optional
-        What carries the requests, for tests and special networks.
+        Transport of the requests, for tests and special networks.
 
     Raises
     ------
     ClientError
-        When ``url`` is no address. All methods raise kin of it; docs/client.md lists them.
+        When ``url`` is not an address. All methods raise subclasses of it; docs/client.md lists them.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class AsyncClient:
         )
 
     async def table(self) -> TableAnswer:
-        """Tell which table answers."""
+        """Describe the table that answers."""
         return await self._ask(Call(method="GET", path="/v1/table", query=self.settings.table_query), table_answer)
 
     async def tables(self) -> tuple[TableAnswer, ...]:
@@ -144,12 +144,12 @@ class AsyncClient:
     async def fixes(self, target_id: str | None = None) -> AsyncIterator[FixEvent]:
         """Listen to the fixes that the service makes of anyone's reports, until the iteration is ended.
 
-        A connection that is lost is made again; fixes in between are lost.
+        A lost connection is opened again; fixes in between are missing.
 
         Parameters
         ----------
         target_id : str, optional
-            The only target to hear of.
+            Listen to the fixes of this target only.
         """
         query = self.settings.feed_query(target_id)
         feed = Feed(self.settings.retries, self._random)
@@ -164,7 +164,7 @@ class AsyncClient:
                             event = feed.take(line)
                             if event is not None:
                                 yield event
-                        seconds = feed.lost("the service ended it")
+                        seconds = feed.lost("the service closed it")
                     else:
                         seconds = feed.refused(
                             answer.status_code, await answer.aread(), answer.headers.get("retry-after")
@@ -178,7 +178,7 @@ class AsyncClient:
     ) -> AsyncIterator[FixAnswer | ProblemError]:
         """Send reports over one web socket, each when the last is answered; yields the answers.
 
-        For one sender of many reports this is faster than requests. A lost connection is not made again.
+        For one sender of many reports this is faster than requests. A lost connection is not opened again.
         """
         with needs_extra("client"):
             from websockets.exceptions import WebSocketException

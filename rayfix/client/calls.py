@@ -1,4 +1,4 @@
-"""What is sent and what becomes of the answers, without any input or output: both clients drive the same flows.
+"""Requests and their answers without input or output; both clients drive the same flows.
 
 A flow is a generator. It yields a :class:`Call`, for which it is sent a :class:`Reply` or a :class:`NoReply`, or a
 :class:`Pause`, and returns what the caller wants.
@@ -17,10 +17,10 @@ from rayfix.errors import AnswerError, ProblemError, ProblemField, RefusedReport
 T = TypeVar("T")
 
 BATCH_REPORTS = 1000
-"""Reports that the service takes in one batch."""
+"""Reports of one batch; the service accepts no more."""
 
 BATCH_BYTES = 8 << 20
-"""Bytes of one batch; the service takes twice as much."""
+"""Bytes of one batch; the service accepts twice as many."""
 
 _REPORT_PROBLEMS = frozenset({"urn:rayfix:problem:invalid-report", "urn:rayfix:problem:malformed-json"})
 _JSON = {"content-type": "application/json"}
@@ -39,7 +39,7 @@ class Call:
 
 @dataclass(frozen=True, kw_only=True)
 class Reply:
-    """An answer; names of headers are lower case."""
+    """An answer; names of headers are in lower case."""
 
     status: int
     headers: Mapping[str, str]
@@ -64,7 +64,7 @@ Flow = Generator[Call | Pause, Reply | NoReply | None, T]
 
 
 def request(call: Call, parse: Callable[[Any], T], policy: RetryPolicy, random: Random) -> Flow[T]:
-    """Send a request, again where that may help, and read its answer.
+    """Send a request, retry it where that may help, and read its answer.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def read(reply: Reply, parse: Callable[[Any], T]) -> T:
     ProblemError
         For a problem document.
     AnswerError
-        For anything that the service does not answer.
+        For an answer that is not of this service.
     """
     try:
         document = json.loads(reply.body)
@@ -105,13 +105,13 @@ def read(reply: Reply, parse: Callable[[Any], T]) -> T:
         try:
             return parse(document)
         except (KeyError, TypeError, ValueError, AttributeError):
-            text = "is none of this service's, or of another version; is the address right?"
+            text = "is not one of this service, or of another version; is the address right?"
             raise AnswerError(f"the answer (status {reply.status}) {text}") from None
     raise problem(document, reply.status)
 
 
 def problem(document: Any, status: int) -> ProblemError | AnswerError:
-    """Turn a problem document into the error that it means."""
+    """Convert a problem document into an error."""
     try:
         errors = tuple(ProblemField(path=one["path"], message=one["message"]) for one in document["errors"])
         kind, detail = document["type"], document["detail"]
@@ -127,16 +127,16 @@ def stream_answer(message: str | bytes) -> FixAnswer | ProblemError:
     Raises
     ------
     AnswerError
-        For what is neither a fix nor a problem.
+        When it is neither a fix nor a problem.
     """
     try:
         return batch_answers({"results": [json.loads(message)]}, 1)[0]
     except (KeyError, TypeError, ValueError, AttributeError):
-        raise AnswerError("the stream answers with what is no fix; is the address right?") from None
+        raise AnswerError("an answer of the stream is not a fix; is the address right?") from None
 
 
 def reason_of(error: Exception) -> str:
-    """Say why there is no answer, in a few words."""
+    """Return the reason why there is no answer."""
     return str(error) or type(error).__name__
 
 
@@ -150,7 +150,7 @@ def report_bytes(report: Any) -> bytes:
 
 
 def position_call(report: Any, query: Mapping[str, str]) -> Call:
-    """Call for the position of one report; its target is in a header, for proxies that choose a worker by it."""
+    """Call for the position of one report; a header names its target, for proxies that route by it."""
     target = report.get("target_id") if isinstance(report, Mapping) else getattr(report, "target_id", None)
     headers = dict(_JSON)
     if isinstance(target, str) and target.isascii() and target.isprintable():
@@ -159,7 +159,7 @@ def position_call(report: Any, query: Mapping[str, str]) -> Call:
 
 
 def batch_calls(reports: Iterable[Any], query: Mapping[str, str]) -> Iterator[tuple[int, Call]]:
-    """Cut reports into batches that the service takes; each with the number of its reports."""
+    """Split reports into batches that the service accepts; yields each with the number of its reports."""
     batch: list[bytes] = []
     size = 0
     for report in reports:
@@ -174,7 +174,7 @@ def batch_calls(reports: Iterable[Any], query: Mapping[str, str]) -> Iterator[tu
 
 
 def batch_answers(document: Any, count: int) -> tuple[FixAnswer | ProblemError, ...]:
-    """Read the answers to a batch; ValueError for what are not so many fixes and problems."""
+    """Read the answers to a batch; ValueError when they are not ``count`` fixes and problems."""
     answers: list[FixAnswer | ProblemError] = []
     for one in document["results"]:
         if "errors" in one:

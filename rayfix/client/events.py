@@ -12,14 +12,14 @@ class ServerEvent:
 
 
 class EventReader:
-    """Puts events together from lines; knows nothing of where they come from."""
+    """Assembles events from lines."""
 
     def __init__(self) -> None:
         self._name = ""
         self._data: list[str] = []
 
     def take(self, line: str) -> ServerEvent | None:
-        """Take a line without its end; returns the event that it ends."""
+        """Take a line without its line break and return the event that it completes, if any."""
         if not line:
             event = ServerEvent(name=self._name or "message", data="\n".join(self._data)) if self._data else None
             self._name, self._data = "", []

@@ -1,4 +1,4 @@
-"""The feed of fixes as a client sees it: events out of lines, and when to listen again."""
+"""The feed of fixes as a client sees it: events from lines, and reconnection."""
 
 import json
 from random import Random
@@ -10,11 +10,11 @@ from rayfix.client.retries import RetryPolicy, is_temporary
 from rayfix.errors import AnswerError, UnreachableError
 
 SILENCE_SECONDS = 45.0
-"""The service writes something every 15 s; after this long without, the connection is lost."""
+"""The service writes at least every 15 s; after this time without data, the connection counts as lost."""
 
 
 class Feed:
-    """What both clients do with the lines of a feed, and with its end.
+    """Handles the lines of a feed and its end, for both clients.
 
     Parameters
     ----------
@@ -29,16 +29,16 @@ class Feed:
         self._reader = EventReader()
 
     def opened(self) -> None:
-        """Begin with the lines of a new connection."""
+        """Begin a new connection."""
         self._reader = EventReader()
 
     def take(self, line: str) -> FixEvent | None:
-        """Take a line; returns the fix that it ends.
+        """Take a line and return the fix that it completes, if any.
 
         Raises
         ------
         AnswerError
-            When an event is none of this service's.
+            When an event is not of this service.
         """
         self._attempt = 0
         event = self._reader.take(line)
@@ -47,15 +47,15 @@ class Feed:
         try:
             return fix_event(json.loads(event.data))
         except (KeyError, TypeError, ValueError, AttributeError):
-            raise AnswerError("the feed tells of something that is no fix; is the address right?") from None
+            raise AnswerError("an event of the feed is not a fix; is the address right?") from None
 
     def refused(self, status: int, body: bytes, retry_after: str | None) -> float:
-        """Return the pause after an answer that is no feed, s.
+        """Return the pause after an answer that is not a feed, s.
 
         Raises
         ------
         ClientError
-            When trying again will not help, or patience has ended.
+            When another attempt cannot help, or all attempts have failed.
         """
         if is_temporary(status):
             return self.lost(f"status {status}", retry_after)
@@ -66,12 +66,12 @@ class Feed:
         raise problem(document, status)
 
     def lost(self, reason: str, retry_after: str | None = None) -> float:
-        """Return the pause after which to listen again, s.
+        """Return the pause before the next connection, s.
 
         Raises
         ------
         UnreachableError
-            When patience has ended.
+            When all attempts have failed.
         """
         self._attempt += 1
         pause = self._policy.pause(self._attempt, self._random, retry_after)

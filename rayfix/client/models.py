@@ -25,7 +25,7 @@ class Point:
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """One place where the target may be."""
+    """One possible position of the target."""
 
     probability: float
     position: Point
@@ -34,7 +34,7 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What became of one measurement; ``reason`` says why it was not used."""
+    """Result for one measurement; ``reason`` says why it was not used."""
 
     index: int
     used: bool

@@ -1,4 +1,4 @@
-"""When a request is sent again, and after which pause."""
+"""Retries of requests and the pauses between them."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,19 +14,18 @@ _AGAIN = frozenset({429, 502, 503, 504})
 
 @dataclass(frozen=True, kw_only=True)
 class RetryPolicy:
-    """How often and how patiently requests are repeated.
+    """How often requests are repeated, and after which pauses.
 
-    A report may be sent twice: the service remembers nothing of it, and where it follows targets a report of the same
-    time is not counted again.
+    A report may be sent twice: fixes are stateless, and tracks ignore a second report of the same time.
 
     Attributes
     ----------
     attempts : int
-        Times that a request is sent at most; 1 for never again.
+        Maximum number of attempts; 1 turns retries off.
     first_pause, longest_pause : float, s
         The pause before attempt n + 1 is drawn from 0 to ``first_pause`` times 2 to the power n - 1, and at most the
-        longest: clients that lost the service together do not come back together ("full jitter": M. Brooker,
-        "Exponential backoff and jitter", 2015).
+        longest, so that clients that lost the service at the same time do not return at the same time ("full jitter":
+        M. Brooker, "Exponential backoff and jitter", 2015).
     longest_retry_after : float, s
         A service that asks for a longer pause than this is not asked again.
 
@@ -46,7 +45,7 @@ class RetryPolicy:
         check_limits(self)
 
     def pause(self, attempt: int, random: Random, retry_after: str | None = None) -> float | None:
-        """Pause after the attempt of that number, from 1 on; None where there is to be no other, s.
+        """Return the pause after an attempt, counted from 1, in seconds; None after the last one.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Where the service is and how it is asked; both clients share it."""
+"""Address of the service and options of requests, for both clients."""
 
 from dataclasses import dataclass, field
 from urllib.parse import urlencode, urlsplit
@@ -20,9 +20,9 @@ class ClientSettings:
     table : str or None
         Name of the table, where the service has several.
     track : bool or None
-        Whether targets are to be followed; None leaves it to the service.
+        Whether to track targets; None leaves it to the service.
     timeout : float, s
-        That connecting, and then each piece of an answer, may take.
+        Time limit of connecting, and of each part of an answer.
     retries : RetryPolicy
     """
 
@@ -34,10 +34,10 @@ class ClientSettings:
     retries: RetryPolicy = field(default_factory=RetryPolicy)
 
     def __post_init__(self) -> None:
-        """Refuse what is no address."""
+        """Refuse what is not an address."""
         parts = urlsplit(self.url)
         if parts.scheme not in ("http", "https") or not parts.netloc or parts.query or parts.fragment:
-            raise ClientError(f"url {self.url!r} is no address of a service; give e.g. http://localhost:8000")
+            raise ClientError(f"url {self.url!r} is not the address of a service; give e.g. http://localhost:8000")
 
     @property
     def base(self) -> str:
@@ -51,7 +51,7 @@ class ClientSettings:
 
     @property
     def table_query(self) -> dict[str, str]:
-        """Query of whatever is about a table."""
+        """Query of requests about a table."""
         return {} if self.table is None else {"table": self.table}
 
     @property

@@ -44,7 +44,7 @@ T = TypeVar("T")
 
 
 class Client:
-    """Asks a service for positions. It may be used from several threads; close it, or use it as a context.
+    """Sends reports to a service. It may be used from several threads; close it, or use it as a context manager.
 
     Parameters
     ----------
@@ -53,12 +53,12 @@ class Client:
     api_key, table, track, timeout, retries
         As in :class:`~rayfix.client.settings.ClientSettings`.
     transport : httpx.BaseTransport, optional
-        What carries the requests, for tests and special networks.
+        Transport of the requests, for tests and special networks.
 
     Raises
     ------
     ClientError
-        When ``url`` is no address. All methods raise kin of it; docs/client.md lists them.
+        When ``url`` is not an address. All methods raise subclasses of it; docs/client.md lists them.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Client:
         return self._ask(Call(method="GET", path="/v1/stations", query=self.settings.table_query), station_answers)
 
     def table(self) -> TableAnswer:
-        """Tell which table answers."""
+        """Describe the table that answers."""
         return self._ask(Call(method="GET", path="/v1/table", query=self.settings.table_query), table_answer)
 
     def tables(self) -> tuple[TableAnswer, ...]:
@@ -142,12 +142,12 @@ class Client:
     def fixes(self, target_id: str | None = None) -> Iterator[FixEvent]:
         """Listen to the fixes that the service makes of anyone's reports, until the iteration is ended.
 
-        A connection that is lost is made again; fixes in between are lost.
+        A lost connection is opened again; fixes in between are missing.
 
         Parameters
         ----------
         target_id : str, optional
-            The only target to hear of.
+            Listen to the fixes of this target only.
         """
         query = self.settings.feed_query(target_id)
         feed = Feed(self.settings.retries, self._random)
@@ -162,7 +162,7 @@ class Client:
                             event = feed.take(line)
                             if event is not None:
                                 yield event
-                        seconds = feed.lost("the service ended it")
+                        seconds = feed.lost("the service closed it")
                     else:
                         seconds = feed.refused(answer.status_code, answer.read(), answer.headers.get("retry-after"))
             except httpx.TransportError as error:
@@ -172,7 +172,7 @@ class Client:
     def stream(self, reports: Iterable[Mapping[str, Any] | object]) -> Iterator[FixAnswer | ProblemError]:
         """Send reports over one web socket, each when the last is answered; yields the answers.
 
-        For one sender of many reports this is faster than requests. A lost connection is not made again.
+        For one sender of many reports this is faster than requests. A lost connection is not opened again.
         """
         with needs_extra("client"):
             from websockets.exceptions import WebSocketException

@@ -52,8 +52,10 @@ def seed_number(text: str) -> int:
 
 
 def mass_share(text: str) -> float:
-    """Read a share of a cell's mass."""
-    return _number(text, float, lambda share: 0.0 <= share < 1.0, "is no share; give 0 or more, below 1, e.g. 0.01")
+    """Read a fraction of a cell's mass."""
+    return _number(
+        text, float, lambda share: 0.0 <= share < 1.0, "is not a fraction; give 0 or more, below 1, e.g. 0.01"
+    )
 
 
 def coordinate(text: str) -> float:

@@ -1,4 +1,4 @@
-"""A UE in the bundled hall that one station sees and three hear by reflection: its place and the report it causes."""
+"""A UE in the bundled hall that one station sees and three hear by reflection: its position and its report."""
 
 import json
 from typing import Any

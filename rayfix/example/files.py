@@ -12,7 +12,7 @@ _WINDOWS = "windows_deg = [1.25, 5, 15]"
 
 
 def write_example(folder: str | Path, *, windows_deg: tuple[float, ...] = (1.25, 5.0, 15.0)) -> Path:
-    """Write the hall's scene, its site file and a report into a folder, which is made when it is not there.
+    """Write the hall's scene, its site file and a report into a folder, which is created if needed.
 
     Returns
     -------
@@ -22,7 +22,7 @@ def write_example(folder: str | Path, *, windows_deg: tuple[float, ...] = (1.25,
     Raises
     ------
     RayfixError
-        When the folder cannot be written, or has other files of these names: they may hold somebody's work.
+        When the folder cannot be written, or holds other files of these names, which are not overwritten.
     """
     folder = Path(folder)
     files = {
@@ -34,9 +34,7 @@ def write_example(folder: str | Path, *, windows_deg: tuple[float, ...] = (1.25,
         folder.mkdir(parents=True, exist_ok=True)
         for path, content in files.items():
             if path.exists() and path.read_bytes() != content:
-                raise RayfixError(
-                    f"{path} is there and is not the example's; choose another folder, or remove it first"
-                )
+                raise RayfixError(f"{path} exists and is not the example's; choose another folder, or remove it first")
         for path, content in files.items():
             path.write_bytes(content)
     except OSError as error:

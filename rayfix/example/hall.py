@@ -120,7 +120,7 @@ def _rack(name: str, low: tuple[float, float], high: tuple[float, float]) -> lis
     inner_start, inner_end = start + thickness, end - thickness
     for i, z in enumerate(levels):
         boxes.append(span(inner_start, inner_end, z, z + thickness, f"board_{i + 1}", "metal"))
-    # Three stacks of goods per board; every third place stays empty, so that rays find ways through.
+    # Three stacks of goods per board; every third position stays empty, so that rays pass through.
     width = (inner_end - inner_start) / 4
     for i, z in enumerate(levels[:-1]):
         for j in range(4):

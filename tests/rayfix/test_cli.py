@@ -137,7 +137,7 @@ def test_the_example_spares_what_is_there(capsys: pytest.CaptureFixture[str], tm
     (tmp_path / "report.json").unlink()
     status, out, err = run(capsys, "example", tmp_path)
     assert (status, out) == (2, "")
-    assert "site.toml is there and is not the example's; choose another folder" in one_line(err)
+    assert "site.toml exists and is not the example's; choose another folder" in one_line(err)
     assert site.read_text(encoding="utf-8") == "# days of work"
     assert not (tmp_path / "report.json").exists()
     assert (tmp_path / "hall.glb").read_bytes() == files["hall.glb"]
@@ -214,7 +214,7 @@ def test_build_writes_a_table_and_a_summary(capsys: pytest.CaptureFixture[str], 
         (["plot", "{table}", "{site}", "-o", "{tmp}/p.png", "--truth", "1", "nan", "1"], r"'nan' is no coordinate"),
         (["plot", "{table}", "{site}", "-o", "{tmp}/p"], r"p is no name of a picture; end it in \.png, \.svg or \.pdf"),
         (["plot", "{table}", "{site}", "-o", "{tmp}/no/p.png"], r"there is no folder .*no; create it first"),
-        (["view", "{table}", "{site}", "-o", "{site}"], r"site\.toml is no name of a page; end it in \.html"),
+        (["view", "{table}", "{site}", "-o", "{site}"], r"site\.toml is not the name of a page; end it in \.html"),
         (["serve", "{tmp}/none.h5", "--port", "0"], r"there is no table at"),
         (["serve", "{table}", "--cors-origin", "maps.example.com"], r"is no origin; give scheme, host and port"),
         (["serve", "{table}", "--cors-origin", "https://a.example/x"], r"is no origin; give scheme, host and port"),

@@ -1,4 +1,4 @@
-"""Gaussian mixtures on a grid of two coordinates, and the contours that hold a share of them."""
+"""Gaussian mixtures on a grid of two coordinates, and the contours that hold a fraction of their mass."""
 
 from collections.abc import Sequence
 
@@ -45,7 +45,7 @@ def credible_levels(density: NDArray[np.float64], shares: Sequence[float]) -> li
     Parameters
     ----------
     density : ndarray
-        On an even grid.
+        On a uniform grid.
     shares : sequence of float
         Between 0 and 1.
     """

@@ -1,4 +1,4 @@
-"""What pictures share: how a plan lies, which names their files may have, and one clear error where writing fails."""
+"""Shared by all pictures: orientation of a plan, allowed file names, and one clear error where writing fails."""
 
 from pathlib import Path
 

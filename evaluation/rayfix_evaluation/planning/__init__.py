@@ -1,1 +1,1 @@
-"""Planning maps: how well a site will locate over its floor, told by its table alone."""
+"""Planning maps: accuracy over the floor of a site, predicted from its table alone."""

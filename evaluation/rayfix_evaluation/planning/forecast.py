@@ -1,4 +1,4 @@
-"""Forecast of the fixes over a floor: what stations would report from each place, located with the table itself."""
+"""Forecast of the fixes over a floor: simulated reports from each square, located with the table itself."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rayfix_evaluation.drops.accuracy import clear_of_solids
 from rayfix_evaluation.drops.bound import information_bound
 from rayfix_evaluation.drops.simulate import Noise, Timing, fold_direction
-from rayfix_evaluation.planning.station_mixture import HeardPaths, heard_paths
+from rayfix_evaluation.planning.station_mixture import AudiblePaths, audible_paths
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, Report, TimeDifference, TimeOfArrival
 from rayfix_tables.errors import RayfixError
@@ -21,11 +21,11 @@ from rayfix_tables.table import Table
 Array = NDArray[np.float64]
 
 Progress = Callable[[int, int], None]
-"""Told how many reports are located, and of how many."""
+"""Called with the number of reports that are located, and with their total number."""
 
-_MARGIN = 0.06  # m; places nearer to solids are left out
-_TRIES = 10  # places that are tried for each that is drawn
-_CLOCK = 100.0  # m; where a simulated clock stands
+_MARGIN = 0.06  # m; positions nearer to solids are left out
+_TRIES = 10  # positions that are tried for each that is drawn
+_CLOCK = 100.0  # m; offset of a simulated clock
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ class PlanSettings:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        """Refuse settings that cannot be."""
+        """Refuse settings out of range."""
         for name in ("spacing", "threshold"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
@@ -76,7 +76,9 @@ class PlanSettings:
         if self.seed < 0:
             raise RayfixError(f"the seed is {self.seed}; give 0 or more")
         if self.timing != "none" and self.noise.range_stdev is None:
-            raise RayfixError(f"the timing is '{self.timing}', but the deviation of a range is not given; give it in m")
+            raise RayfixError(
+                f"the timing is '{self.timing}', but the standard deviation of a range is not given; give it in m"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,14 +90,14 @@ class PlanMap:
     settings : PlanSettings
     table_id : str
     position : ndarray of shape (n, 3), m
-        Middles of the squares.
-    heard : ndarray of shape (n, n_stations)
-        Share of a square's places that each station of the site hears.
+        Centres of the squares.
+    audible : ndarray of shape (n, n_stations)
+        Fraction of a square's sampled positions that are audible to each station of the site.
     bound : ndarray of shape (n,), m
         Root mean square of the position error bounds of the reported paths; infinite where one of them leaves a
-        direction open.
+        direction undetermined.
     error : ndarray of shape (n,), m
-        Root mean square error to expect, rivals included; infinite where a report gives no fix.
+        Expected root mean square error, other candidates included; infinite where a report gives no fix.
     within : ndarray of shape (n,)
         Probability that the error is below the threshold.
     """
@@ -103,7 +105,7 @@ class PlanMap:
     settings: PlanSettings
     table_id: str
     position: Array
-    heard: Array
+    audible: Array
     bound: Array
     error: Array
     within: Array
@@ -113,13 +115,13 @@ class PlanMap:
         return len(self.position)
 
     @cached_property
-    def num_heard(self) -> Array:
-        """Mean number of stations that hear a place of each square, shape (n,)."""
-        return np.asarray(self.heard.sum(axis=1))
+    def num_audible(self) -> Array:
+        """Mean number of stations to which a position in each square is audible, shape (n,)."""
+        return np.asarray(self.audible.sum(axis=1))
 
     @property
     def coverage(self) -> float:
-        """Share of all fixes whose error will be below the threshold."""
+        """Fraction of all fixes whose error is below the threshold."""
         return float(self.within.mean())
 
 
@@ -135,7 +137,7 @@ def forecast(table: Table, settings: PlanSettings, progress: Progress | None = N
     squares, places = draw_places(table, settings.height, settings.spacing, settings.draws, rng)
     stations = table.site.stations
     noise = rng.standard_normal((len(places), len(stations), 3))
-    paths = [heard_paths(table.levels(station.id)[0], places) for station in stations]
+    paths = [audible_paths(table.levels(station.id)[0], places) for station in stations]
     locator = Locator(table)
     bound, square, within = np.empty(len(places)), np.empty(len(places)), np.empty(len(places))
     for n in range(len(places)):
@@ -145,13 +147,13 @@ def forecast(table: Table, settings: PlanSettings, progress: Progress | None = N
             progress(n + 1, len(places))
     middles, first = np.unique(squares, axis=0, return_index=True)
     shape = (len(middles), settings.draws)
-    heard = np.stack([path.heard for path in paths], axis=1)
+    audible = np.stack([path.audible for path in paths], axis=1)
     assert np.array_equal(first, np.arange(len(middles)) * settings.draws)  # squares come whole and in order
     return PlanMap(
         settings=settings,
         table_id=table.table_id,
         position=middles,
-        heard=heard.reshape(*shape, -1).mean(axis=1),
+        audible=audible.reshape(*shape, -1).mean(axis=1),
         bound=np.sqrt(np.square(bound).reshape(shape).mean(axis=1)),
         error=np.sqrt(square.reshape(shape).mean(axis=1)),
         within=within.reshape(shape).mean(axis=1),
@@ -172,7 +174,7 @@ def draw_places(
     Returns
     -------
     squares : ndarray of shape (n * count, 3), m
-        Middle of the square of each place, ascending.
+        Centre of the square of each position, ascending.
     places : ndarray of shape (n * count, 3), m
         In the free space. Squares that are hardly free are left out.
 
@@ -209,13 +211,13 @@ def draw_places(
     return np.repeat(middles[usable], count, axis=0), places.reshape(-1, 3)
 
 
-def _bound(paths: Sequence[HeardPaths], place: int, settings: PlanSettings) -> float:
+def _bound(paths: Sequence[AudiblePaths], place: int, settings: PlanSettings) -> float:
     """Bound as in :mod:`rayfix_evaluation.drops.bound`, from the gradients that the table gives."""
     noise = settings.noise
     information = np.zeros((3, 3))
     lengths = []
     for path in paths:
-        if not path.heard[place]:
+        if not path.audible[place]:
             continue
         length, horizontal, vertical = path.gradients[place]
         across = max(float(np.sin(path.zenith[place])), 1e-6) * noise.azimuth_stdev
@@ -235,7 +237,7 @@ def _outlook(locator: Locator, measurements: tuple[Measurement, ...], threshold:
 
 
 def _measure(
-    stations: Sequence[Station], paths: Sequence[HeardPaths], place: int, settings: PlanSettings, errors: Array
+    stations: Sequence[Station], paths: Sequence[AudiblePaths], place: int, settings: PlanSettings, errors: Array
 ) -> tuple[Measurement, ...]:
     """Measurements from a place; ``errors`` in standard deviations, of shape (n_stations, 3)."""
     noise, timing = settings.noise, settings.timing
@@ -243,7 +245,7 @@ def _measure(
     measurements: list[Measurement] = []
     arrivals: list[tuple[str, float]] = []
     for station, path, error in zip(stations, paths, errors, strict=True):
-        if not path.heard[place]:
+        if not path.audible[place]:
             continue
         azimuth, zenith = fold_direction(
             path.azimuth[place] + station.bias.azimuth + error[0] * noise.azimuth_stdev,
@@ -288,8 +290,8 @@ def summary(plan: PlanMap) -> dict[str, Any]:
         "coverage": plan.coverage,
         "error_m": {"50": finite(expected[0]), "90": finite(expected[1])},
         "stations_heard": {
-            "mean": float(plan.num_heard.mean()),
-            "share_below_2": float(np.mean(plan.num_heard < 2.0)),
+            "mean": float(plan.num_audible.mean()),
+            "share_below_2": float(np.mean(plan.num_audible < 2.0)),
         },
     }
 

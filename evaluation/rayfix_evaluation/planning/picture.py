@@ -34,7 +34,7 @@ class _Quantity:
 
 
 def draw_plan(path: str | Path, table: Table, plan: PlanMap) -> None:
-    """Draw the map of one table: the error to expect, the probability of a useful fix, and the stations heard.
+    """Draw the map of one table: expected error, probability of a useful fix, and number of audible stations.
 
     Parameters
     ----------
@@ -43,8 +43,8 @@ def draw_plan(path: str | Path, table: Table, plan: PlanMap) -> None:
     """
     figure, panels = _figure(table, rows=3, columns=1)
     stations = len(table.site.stations)
-    heard = _Quantity(
-        title="stations that hear a place",
+    audible = _Quantity(
+        title="audible stations",
         label="stations",
         cmap=get_cmap("cividis"),
         norm=Normalize(0.0, float(stations)),
@@ -52,7 +52,7 @@ def draw_plan(path: str | Path, table: Table, plan: PlanMap) -> None:
     for axes, quantity, values in (
         (panels[0][0], _error(plan.error), plan.error),
         (panels[1][0], _within(plan), plan.within),
-        (panels[2][0], heard, plan.num_heard),
+        (panels[2][0], audible, plan.num_audible),
     ):
         _draw_panel(figure, axes, table, plan, quantity, values)
     _save(figure, path, _title(table, plan))
@@ -157,10 +157,10 @@ def _draw_panel(figure: Figure, axes: Axes, table: Table, plan: PlanMap, quantit
     along = int(np.argmax(high - low))
     order = [along, 1 - along]
     corners, grid = _grid(plan, values, order)
-    lost = np.isposinf(grid)
-    if lost.any():
+    no_fix = np.isposinf(grid)
+    if no_fix.any():
         # Where a report gives no fix at all, no colour of the scale would be right.
-        axes.pcolormesh(*corners, np.ma.masked_where(~lost, np.ones_like(grid)), cmap=_one_colour(_NO_FIX))
+        axes.pcolormesh(*corners, np.ma.masked_where(~no_fix, np.ones_like(grid)), cmap=_one_colour(_NO_FIX))
     shown = np.ma.masked_invalid(grid)
     mesh = axes.pcolormesh(*corners, shown, cmap=quantity.cmap, norm=quantity.norm)
     bar = figure.colorbar(mesh, ax=axes, label=quantity.label, fraction=0.03, pad=0.01)
@@ -174,7 +174,7 @@ def _draw_panel(figure: Figure, axes: Axes, table: Table, plan: PlanMap, quantit
     for station in table.site.stations:
         spot = (station.position[along], station.position[1 - along])
         axes.plot(*spot, marker="^", markersize=8, color=_PAPER, markeredgecolor=_INK, linestyle="none")
-        # Towards the middle, where there is room.
+        # Towards the centre, where there is space.
         right = spot[0] < 0.5 * (low + high)[along]
         up = (spot[1] < 0.5 * (low + high)[1 - along]) == (along == 0)
         axes.annotate(
@@ -197,7 +197,7 @@ def _draw_panel(figure: Figure, axes: Axes, table: Table, plan: PlanMap, quantit
 
 
 def _draw_solids(axes: Axes, table: Table, height: float, order: list[int]) -> None:
-    """Shade where nobody can be at this height."""
+    """Shade what is solid at this height."""
     free_space = table.scene.free_space
     layer = int((height - free_space.origin[2]) / free_space.voxel_size)
     blocked = ~np.asarray(free_space.free[:, :, layer])

@@ -1,4 +1,4 @@
-"""Planning maps from the command line: forecast one table or two, draw, and tell the figures."""
+"""Planning maps from the command line: forecast one table or two, draw the maps, and print a summary."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -98,7 +98,7 @@ def plan_document(table: Table, plan: PlanMap) -> dict[str, Any]:
                 "error_m": finite(plan.error[n]),
                 "bound_m": finite(plan.bound[n]),
                 "within_threshold": float(plan.within[n]),
-                "heard": {s.id: float(share) for s, share in zip(table.site.stations, plan.heard[n], strict=True)},
+                "heard": {s.id: float(share) for s, share in zip(table.site.stations, plan.audible[n], strict=True)},
             }
             for n in range(len(plan))
         ],
@@ -106,13 +106,13 @@ def plan_document(table: Table, plan: PlanMap) -> dict[str, Any]:
 
 
 def plan_lines(maps: list[tuple[Table, PlanMap]]) -> Iterator[str]:
-    """Lines for people to read, one for each map and one for the change."""
+    """Summary for the terminal: a line for each map and one for the change."""
     for table, plan in maps:
         figures = summary(plan)
         middle, most = (_metres(figures["error_m"][share]) for share in ("50", "90"))
         yield (
-            f"{table.path.name}: {plan.coverage:.1%} of fixes within {plan.settings.threshold:g} m; error to expect "
-            f"{middle} in half of {len(plan)} squares, {most} in 90 %; {plan.num_heard.mean():.1f} stations heard"
+            f"{table.path.name}: {plan.coverage:.1%} of fixes within {plan.settings.threshold:g} m; expected error "
+            f"{middle} in half of {len(plan)} squares, {most} in 90 %; {plan.num_audible.mean():.1f} audible stations"
         )
     if len(maps) == 2:
         (_, one), (_, other) = maps
@@ -125,7 +125,7 @@ def _metres(value: float | None) -> str:
 
 @contextmanager
 def _bar(text: str, *, enabled: bool) -> Iterator[PlanProgress | None]:
-    """Show on standard error how many places are done."""
+    """Show progress on standard error."""
     if not enabled:
         yield None
         return

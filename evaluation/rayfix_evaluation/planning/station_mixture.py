@@ -1,9 +1,9 @@
-"""Which path a station would report from a place, as the table itself says.
+"""The path that a station would report from a position, according to the table itself.
 
 The cells of a level hold the measure N(a; 0, W) s^2 pi dOmega ds, a density over places (docs/how-it-works.md): at a
 place x, a path k of direction a_k adds N(a_k - c; 0, W) pi_k to the density of the cell of centre c. So the cell whose
 density is the largest looks towards the path of the largest pi, which is the one most probably reported. The sum over
-all cells times their solid angles is the sum of pi: 1 where the station hears anything, 0 where it does not.
+all cells times their solid angles is the sum of pi: 1 where the position is audible to the station, 0 where it is not.
 """
 
 from dataclasses import dataclass
@@ -19,20 +19,20 @@ from rayfix_tables.mixture import TubeMixture, joint_cov, unpack
 
 Array = NDArray[np.float64]
 
-HEARD_ABOVE = 0.25
-"""Sum of the probabilities of a station's paths to a place above which it counts as heard there.
+AUDIBLE_ABOVE = 0.25
+"""Sum of the probabilities of a station's paths to a place above which the place is audible to it.
 
 Mixtures blur the edges of shadows: in the bundled hall the sum is above this at 19 of 20 places with a path, and below
 it at 9 of 10 without.
 """
 
 _REACH = 4.0  # standard deviations to which a component counts
-_FLOOR = 1e-3  # m, least deviation of a component along any axis
+_FLOOR = 1e-3  # m, least standard deviation of a component along any axis
 _CHUNK = 100_000  # components whose matrices are unpacked at a time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class HeardPaths:
+class AudiblePaths:
     """The path of a station that is most probably reported from each of n places.
 
     Attributes
@@ -40,7 +40,7 @@ class HeardPaths:
     probability : ndarray of shape (n,)
         Sum of pi over all paths, about 1 where there are any.
     azimuth, zenith : ndarray of shape (n,), rad
-        Of the reported path; zero where nothing is heard, and so are the following.
+        Of the reported path; zero where nothing is audible, as are the following.
     path_length : ndarray of shape (n,), m
     gradients : ndarray of shape (n, 3, 3), 1, rad and rad per m
         d(path length, tangent azimuth, zenith) / dx.
@@ -53,12 +53,12 @@ class HeardPaths:
     gradients: Array
 
     @property
-    def heard(self) -> NDArray[np.bool_]:
-        """Whether the station hears a place at all, shape (n,)."""
-        return self.probability > HEARD_ABOVE
+    def audible(self) -> NDArray[np.bool_]:
+        """Whether a place is audible to the station, shape (n,)."""
+        return self.probability > AUDIBLE_ABOVE
 
 
-def heard_paths(level: Level, places: Array) -> HeardPaths:
+def audible_paths(level: Level, places: Array) -> AudiblePaths:
     """Find the path that is most probably reported from each place.
 
     Parameters
@@ -101,7 +101,7 @@ def heard_paths(level: Level, places: Array) -> HeardPaths:
 
 
 def _as_gaussians(part: TubeMixture) -> tuple[Array, Array, Array, Array]:
-    """Components as Gaussians over the position: log density at the mean, mean, deviations, inverse covariance."""
+    """Components as Gaussians over the position: log density at the mean, mean, standard deviations, precision."""
     cov = joint_cov(part)[:, 3:, 3:] + _FLOOR**2 * np.eye(3)
     log_height = np.asarray(part.log_weight, np.float64) - 0.5 * np.linalg.slogdet(2.0 * np.pi * cov)[1]
     deviation = np.sqrt(np.einsum("nii->ni", cov))
@@ -200,20 +200,20 @@ def _search(
 
 def _as_paths(
     level: Level, cell: NDArray[np.int64], total: Array, u: Array, u_mean: Array, jacobian: Array
-) -> HeardPaths:
+) -> AudiblePaths:
     """Turn tangent coordinates into angles, and tubes into gradients."""
     found = cell >= 0
     centres = level.grid.centres[cell[found]]
     azimuth, zenith = _angles(u[found], centres)
     length = u[found, 0]
-    told = {name: np.zeros(len(cell)) for name in ("azimuth", "zenith", "path_length")}
-    told["azimuth"][found], told["zenith"][found], told["path_length"][found] = azimuth, zenith, length
+    predicted = {name: np.zeros(len(cell)) for name in ("azimuth", "zenith", "path_length")}
+    predicted["azimuth"][found], predicted["zenith"][found], predicted["path_length"][found] = azimuth, zenith, length
     # A turn of the tube's middle: what the reflections do to it is the same for the direction beside it.
     mirror = _turn(u_mean[found, 0], jacobian[found]) @ _frame(*_angles(u_mean[found], centres)).transpose(0, 2, 1)
     turn = mirror @ _frame(azimuth, zenith)
     gradients = np.zeros((len(cell), 3, 3))
     gradients[found] = turn.transpose(0, 2, 1) / _scale(length)[:, :, None]
-    return HeardPaths(probability=total, gradients=gradients, **told)
+    return AudiblePaths(probability=total, gradients=gradients, **predicted)
 
 
 def _angles(u: Array, centres: Array) -> tuple[Array, Array]:

@@ -179,7 +179,7 @@ def reflections_chart(study: Document) -> Figure:
 
 
 def calibration_chart(curves: Sequence[tuple[str, Document, int]]) -> Figure:
-    """Share of truths within ellipsoids by the probability that is stated.
+    """Draw the fraction of true positions within ellipsoids against the stated probability.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def calibration_chart(curves: Sequence[tuple[str, Document, int]]) -> Figure:
     for colour, (label, coverage, _) in zip(SERIES, curves, strict=False):
         axes.plot([float(p) for p in coverage], list(coverage.values()), "o-", color=colour, markersize=4, label=label)
     axes.set_xlabel("stated probability of the ellipsoid")
-    axes.set_ylabel("share of truths within")
+    axes.set_ylabel("fraction of true positions within")
     axes.set_xlim(0.4, 1.0)
     axes.set_ylim(0.2, 1.02)
     axes.legend(loc="lower right")

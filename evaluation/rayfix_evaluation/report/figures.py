@@ -66,7 +66,7 @@ def study_of(results: Document, key: str) -> Document:
 
 
 def figure_specs(evaluation: Evaluation) -> tuple[Spec, ...]:
-    """All figures of an evaluation, in the order of the page."""
+    """List all figures of an evaluation, in the order of the page."""
     scene = backdrop(evaluation.table)
     specs = [
         *_space_specs(evaluation, scene),
@@ -125,11 +125,10 @@ def _space_specs(evaluation: Evaluation, scene: Backdrop) -> list[Spec]:
         Spec(
             key="plane-points",
             title="Rays and their points in the plane of the transmitter",
-            caption="Seen from above: thin lines are rays launched around each measured angle, dots are where they "
-            "cross the plane at the transmitter's height, and the contours hold 50, 80 and 95 % of the Gaussian "
-            "mixture "
-            "fitted to the dots of a station. This is the paper's two-dimensional predecessor, which has to know the "
-            f"height; its product of mixtures is {_miss(pictures, 'plane')} from the true position here.",
+            caption="Top view: thin lines are rays launched around each measured angle, dots are their intersections "
+            "with the plane at the transmitter's height, and contours hold 50, 80 and 95 % of the Gaussian mixture "
+            "fitted to the dots of each station. This is the paper's two-dimensional predecessor, which needs to know "
+            f"the height; the maximum of its product of mixtures is {_miss(pictures, 'plane')} from the true position.",
             draw=lambda: plane_picture(scene, pictures),
         ),
         space("points-aoa", "Points from angles", "points_aoa", points_caption(pictures, "aoa")),
@@ -137,21 +136,19 @@ def _space_specs(evaluation: Evaluation, scene: Backdrop) -> list[Spec]:
             "mixture-aoa",
             "Mixtures from angles",
             "mixture_aoa",
-            "One-sigma ellipsoids of the components that EM fits to each station's points, the darker the heavier. "
-            "They "
-            "follow the rays through the whole building. The product of the mixtures is largest "
-            f"{_miss(pictures, 'aoa')} from the true position.",
+            "One-sigma ellipsoids of the components that EM fits to each station's points; darker ones have larger "
+            "weights. They extend along the rays through the whole building. The maximum of the product of the "
+            f"mixtures is {_miss(pictures, 'aoa')} from the true position.",
         ),
         space("points-aoa-pt", "Points from angles and times", "points_pt", points_caption(pictures, "pt")),
         space(
             "mixture-aoa-pt",
             "Mixtures from angles and times",
             "mixture_pt",
-            "The same after the points have been selected by the propagation time (0.5 m): of each ray only the "
-            "stretch of "
-            "about the measured length is left, so that the mixtures are short and few places can be meant. The "
-            "product "
-            f"is largest {_miss(pictures, 'pt')} from the true position; rayfix is {_miss_rayfix(pictures)} off.",
+            "The same after selection of the points by the propagation time (0.5 m): only the section of each ray near "
+            "the measured length remains, so that the mixtures are compact and few positions are possible. The maximum "
+            f"of the product is {_miss(pictures, 'pt')} from the true position; rayfix is {_miss_rayfix(pictures)} "
+            "off.",
         ),
     ]
     differences = pictures["length_differences"]
@@ -162,10 +159,9 @@ def _space_specs(evaluation: Evaluation, scene: Backdrop) -> list[Spec]:
                 title="Differences of path length of pairs of points",
                 caption=f"Path length of points of {differences['columns']} less that of {differences['rows']}, "
                 f"in metres. With a relative propagation time only the difference is known, here "
-                f"{differences['measured_m']:.2f} m: the shaded pairs agree with it to within two deviations of "
-                f"{differences['stdev_m']:g} m, and Algorithm 2 draws from these. Whole diagonals agree, which is why "
-                "a "
-                "relative time tells less than a time.",
+                f"{differences['measured_m']:.2f} m: the shaded pairs agree with it to within two standard "
+                f"deviations of {differences['stdev_m']:g} m, and Algorithm 2 samples from these. Whole diagonals "
+                "agree: a relative time carries less information than a time.",
                 draw=lambda: differences_chart(differences),
             )
         )
@@ -213,25 +209,25 @@ def _method_specs(results: Document) -> list[Spec]:
             key="methods-percentiles",
             title="Methods side by side",
             caption="Median (filled) and 90th percentile (open) of the error on the same drops, with bootstrap 95 % "
-            "intervals; an arrow points to values beyond 20 m or where there is no position. The grey dots are the "
-            "position error bound, which knows which path each station reported; single errors may be below it, a root "
-            "mean square of an unbiased method may not.",
+            "intervals; an arrow marks values above 20 m or no position. Grey dots are the position error bound, given "
+            "the path that each station reported; single errors can be below it, the root mean square error of an "
+            "unbiased method cannot.",
             draw=lambda: percentiles_chart(points[:3]),
         ),
         Spec(
             key="methods-cdf",
             title="Methods side by side, whole distributions",
-            caption="Share of drops with an error below that of the axis. A curve that ends below 100 % had no "
-            "position for the rest. Methods that take every path for the line of sight fail in a building like this "
-            "whatever they fit.",
+            caption="Cumulative distribution of the error. A curve that ends below 100 % gave no position for the "
+            "remaining drops. Methods that treat every path as line of sight have large errors wherever paths are "
+            "reflected.",
             draw=lambda: methods_cdf(points[:3]),
         ),
         Spec(
             key="calibration",
-            title="Whether the stated uncertainty is right",
-            caption="Share of true positions within rayfix's credible ellipsoids by the probability they state. On "
-            "the dotted line both are the same; the shade is what chance alone does with this many drops. Above it, "
-            "ellipsoids are larger than they need be; below, errors are larger than stated.",
+            title="Calibration of the stated uncertainty",
+            caption="Fraction of true positions within rayfix's credible ellipsoids against the stated probability. "
+            "The dotted line is perfect calibration; the shaded band is the sampling scatter for this number of drops. "
+            "Above it, ellipsoids are too large; below it, too small.",
             draw=lambda: calibration_chart([(label, c, n) for label, c, n in curves if c]),
         ),
     ]
@@ -240,16 +236,16 @@ def _method_specs(results: Document) -> list[Spec]:
 def _planning_spec(results: Document, scene: Backdrop) -> Spec:
     planning = results["planning"]
     figures = "; ".join(
-        f"{plan['label']}: {share(plan['coverage'])} of fixes within {plan['threshold_m']:g} m, error to expect "
+        f"{plan['label']}: {share(plan['coverage'])} of fixes within {plan['threshold_m']:g} m, expected error "
         f"{length(plan['expected_error_m']['50'])} in half of the squares"
         for plan in planning["maps"]
     )
     return Spec(
         key="planning",
         title="Planning maps",
-        caption=f"What the table alone foretells of transmitters at z = {planning['height_m']:g} m, for "
-        f"squares of {planning['spacing_m']:g} m; triangles are stations, lines what the plane cuts. {figures}. "
-        "'rayfix plan' draws such maps for other heights and noise, and beside those of a station added or moved.",
+        caption=f"Prediction from the table alone for transmitters at z = {planning['height_m']:g} m, in "
+        f"squares of {planning['spacing_m']:g} m; triangles are stations, lines the section of the scene. {figures}. "
+        "'rayfix plan' draws such maps for other heights and noise, and compares choices of stations.",
         draw=lambda: planning_chart(scene, planning),
     )
 
@@ -260,8 +256,7 @@ def _arrays_spec(results: Document) -> Spec:
         key="antenna-arrays",
         title="Angle errors of antenna arrays",
         caption="Uniform planar arrays at the stations receive all paths of the forward solver, and four estimators "
-        "look for the strongest. Dotted: the half-power beam width; beyond it, an angle is that of another path or of "
-        "none.",
+        "search for the strongest. Dotted: the half-power beam width; a larger error means another path or no path.",
         draw=lambda: arrays_chart(arrays),
     )
 

@@ -17,7 +17,7 @@ _MOST_TRIANGLES = 20_000
 """Of larger scenes, the triangles of the largest area are drawn."""
 
 _SHELL = 0.9
-"""Triangles that reach over this share of the scene along two axes are the building's shell."""
+"""Triangles that span this fraction of the scene along two axes belong to the building's shell."""
 
 _LEAST_WEIGHT = 0.01
 

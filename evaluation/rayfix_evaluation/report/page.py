@@ -31,16 +31,16 @@ _METHOD_FIGURES = (
 )
 
 _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    ("statements", "What the paper states, and what holds here", ()),
+    ("statements", "The paper's statements, tested here", ()),
     ("site", "The site and the drops", ()),
     ("method", "From angles and times to a position", _METHOD_FIGURES),
-    ("noise", "Accuracy by noise", ("cdf-aoa", "cdf-pt", "cdf-rpt")),
+    ("noise", "Accuracy by measurement noise", ("cdf-aoa", "cdf-pt", "cdf-rpt")),
     ("methods", "Methods side by side", ("methods-percentiles", "methods-cdf")),
-    ("calibration", "Stated and true uncertainty", ("calibration",)),
-    ("planning", "Over the floor", ("planning",)),
-    ("arrays", "Where angles come from", ("antenna-arrays",)),
-    ("stress", "When things are wrong", ()),
-    ("made", "How this was made", ()),
+    ("calibration", "Stated and actual uncertainty", ("calibration",)),
+    ("planning", "Accuracy over the floor", ("planning",)),
+    ("arrays", "Angle errors of antenna arrays", ("antenna-arrays",)),
+    ("stress", "Robustness", ()),
+    ("made", "How to reproduce this page", ()),
 )
 """Sections of the page: name of the template, title, and figures. Figures of stress curves are in that section."""
 
@@ -80,7 +80,7 @@ def render_page(
     figures : Path
         Folder of the written SVGs.
     command : str
-        That made the evaluation.
+        Command line of the evaluation.
     """
     results = evaluation.results
     drawn = {spec.key: _figure(spec, interactive, figures) for spec in specs}
@@ -145,7 +145,7 @@ def _figure(spec: Spec, interactive: Mapping[str, str], figures: Path) -> _Figur
 
 
 def _harmless(text: str) -> str:
-    """JSON that cannot end the script element it stands in."""
+    """Escape JSON so that it cannot close the script element that contains it."""
     return text.replace("</", "<\\/")
 
 
@@ -181,10 +181,16 @@ def _site_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
         ("Paths", f"up to {propagation['max_reflections']} reflections and {propagation['max_path_length_m']:g} m"),
         (
             "Drops",
-            f"{drops['drawn']} uniform in the free space; heard by stations: {heard}; {drops['unheard']} are left out",
+            f"{drops['drawn']} uniform in the free space; audible to stations: {heard}; {drops['unheard']} left out",
         ),
-        ("Line of sight", f"in {share(drops['line_of_sight'])} of the pairs of a drop and a station that hears it"),
-        ("Paths heard", f"{drops['paths_heard']:.1f} by a station of a drop, of which it reports the strongest"),
+        (
+            "Line of sight",
+            f"in {share(drops['line_of_sight'])} of the pairs of a drop and a station to which it is audible",
+        ),
+        (
+            "Audible paths",
+            f"{drops['paths_heard']:.1f} for each pair of a drop and a station, which reports the strongest",
+        ),
     ]
 
 

@@ -24,7 +24,7 @@ TRUTH, FIX, ESTIMATE = "#1a936f", "#d1495b", "#7c3aed"
 
 _SOLID = "#9aa3af"
 _ROOM, _MIDDLE = np.array([0.92, 0.76]), np.array([0.5, 0.52])
-"""Share of a figure that a space takes up, and where its middle is."""
+"""Fraction of a figure that a 3D view takes up, and its centre."""
 
 
 def space_picture(scene: Backdrop, pictures: Pictures, show: str) -> Figure:

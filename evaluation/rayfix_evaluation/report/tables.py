@@ -76,5 +76,5 @@ def write_tables(results: Document, folder: Path) -> None:
 
 
 def method_label(key: str) -> str:
-    """Return what people call a method."""
+    """Return a method's label."""
     return METHODS[key].label

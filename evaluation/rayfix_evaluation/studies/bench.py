@@ -37,7 +37,7 @@ class BenchSettings:
         Tables by variant.
     seed : int
     drops : int
-        Positions that are drawn. Each case takes the first of those that a station hears.
+        Positions that are drawn. Each case takes the first of those that are audible to a station.
     radio_map : RadioMap or None
         Of the fingerprints, where they are among the methods.
     """
@@ -49,7 +49,7 @@ class BenchSettings:
 
 
 class Bench:
-    """Drops, their paths in each world, and the methods, each made when it is first wanted."""
+    """Drops, their paths in each world, and the methods; each is made on first use."""
 
     def __init__(self, settings: BenchSettings) -> None:
         self.settings = settings
@@ -80,7 +80,7 @@ class Bench:
         return self._drops[world, number]
 
     def heard(self, numbers: Sequence[int]) -> list[int]:
-        """Numbers of those drops that a station hears in a world that is as its twin."""
+        """Numbers of those drops that are audible to a station in a world that matches its twin."""
         return [n for n in numbers if self.drop(World(), n).paths]
 
     def run(self, case: Case, method: str, numbers: Sequence[int]) -> tuple[Run, NDArray[np.float64]]:

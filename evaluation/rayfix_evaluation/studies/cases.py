@@ -98,7 +98,7 @@ class Case:
 
     @property
     def noise(self) -> Noise:
-        """True deviations of the measurements."""
+        """True standard deviations of the measurements."""
         angle = float(np.deg2rad(self.angle_deg))
         # A difference has the noise of both of its times.
         single = self.range_stdev / np.sqrt(2.0) if self.timing == "tdoa" else self.range_stdev

@@ -11,7 +11,7 @@ __all__ = ["FULL", "QUICK", "Effort", "Point", "Study", "methods_of", "studies"]
 
 ANGLES_DEG = (0.25, 0.5, 0.75, 1.0)
 RANGES = (0.2, 0.3, 0.5, 0.7, 1.0)
-"""Standard deviations of propagation times in the paper's figures, m; those of its RPT figure are not known to us."""
+"""Standard deviations of propagation times in the paper's figures, m; those of its RPT figure are not published."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +102,7 @@ def _paper_figures(effort: Effort) -> tuple[Study, ...]:
     return (
         Study(
             key="cdf-aoa",
-            title="Error by the noise of the angles, with and without propagation times",
+            title="Error against the noise of the angles, with and without propagation times",
             axis="standard deviation of the angles [deg]",
             drops=effort.drops,
             points=tuple(
@@ -113,14 +113,14 @@ def _paper_figures(effort: Effort) -> tuple[Study, ...]:
         ),
         Study(
             key="cdf-pt",
-            title="Error by the noise of the propagation times",
+            title="Error against the noise of the propagation times",
             axis="standard deviation of the propagation times [m]",
             drops=effort.drops,
             points=tuple(point(f"PT {r:g} m", Case(range_stdev=r), r) for r in RANGES),
         ),
         Study(
             key="cdf-rpt",
-            title="Error by the noise of relative propagation times",
+            title="Error against the noise of relative propagation times",
             axis="standard deviation of the relative propagation times [m]",
             drops=effort.drops,
             points=(
@@ -155,7 +155,7 @@ def _side_by_side(effort: Effort) -> Study:
 
 
 _STRESSED: tuple[str, ...] = ("rayfix", "paper-table", "los-angles")
-"""Methods of the curves: the paper's method where it is quick, and what a classical system does."""
+"""Methods of the curves: the fast variant of the paper's method, and a classical system."""
 
 
 def _stress(effort: Effort, station_ids: Sequence[str], reflections: int) -> tuple[Study, ...]:
@@ -176,14 +176,14 @@ def _stress(effort: Effort, station_ids: Sequence[str], reflections: int) -> tup
     return (
         study(
             "heard",
-            "Stations that hear the transmitter",
+            "Number of audible stations",
             "stations in the report (at most)",
             [(f"{n}", n, Case(heard=n)) for n in heard],
         ),
         study(
             "blocked",
             "Without line of sight",
-            "share of direct paths that are blocked",
+            "fraction of direct paths that are blocked",
             [(f"{share:.0%}", share, Case(blocked=share)) for share in (0.0, 0.25, 0.5, 0.75, 1.0)],
         ),
         study(
@@ -198,20 +198,20 @@ def _stress(effort: Effort, station_ids: Sequence[str], reflections: int) -> tup
         ),
         study(
             "objects",
-            "Objects that are not where the twin has them",
-            "objects off by [cm]",
+            "Displaced objects",
+            "displacement of objects [cm]",
             [(f"{cm} cm", cm, Case(world=World(objects=cm / 100))) for cm in (0, 2, 5, 10)],
         ),
         study(
             "walls",
-            "Outer walls that are not where the twin has them",
-            "walls off by [cm]",
+            "Displaced outer walls",
+            "displacement of walls [cm]",
             [(f"{cm} cm", cm, Case(world=World(walls=cm / 100))) for cm in (0, 1, 2, 5)],
         ),
         study(
             "told",
-            "Standard deviations told wrong",
-            "told over true standard deviation",
+            "Wrong standard deviations",
+            "stated over true standard deviation",
             [(f"{factor:g}", factor, Case(told=factor)) for factor in (0.25, 0.5, 1.0, 2.0, 4.0)],
         ),
         study(
@@ -228,14 +228,14 @@ def _stress(effort: Effort, station_ids: Sequence[str], reflections: int) -> tup
         ),
         study(
             "outliers",
-            "Angles that have nothing to do with the transmitter",
+            "Outlying angles",
             "stations with a random angle",
             [(f"{n}", n, Case(random_angles=n)) for n in range(len(station_ids[:5]))],
         ),
         study(
             "late",
-            "Times that are 10 m late",
-            "stations with a late time",
+            "Times that are 10 m too long",
+            "stations with such a time",
             [(f"{n}", n, Case(late_times=n)) for n in range(len(station_ids[:5]))],
         ),
         _reflections(effort, reflections),
@@ -243,7 +243,7 @@ def _stress(effort: Effort, station_ids: Sequence[str], reflections: int) -> tup
 
 
 def _reflections(effort: Effort, reflections: int) -> Study:
-    """Tables of fewer reflections in the same world, and the whole table in a world of one more."""
+    """Compare tables of fewer reflections in the same world, and the site's table in a world of one reflection more."""
     fewer = [n for n in (1, 2, 3) if n <= reflections]
     points = [
         Point(label=f"table {reflections}, world {reflections}", x=0, case=Case(), methods=("rayfix",)),

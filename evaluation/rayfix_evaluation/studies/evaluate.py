@@ -35,7 +35,7 @@ Progress = Callable[[str, int, int], None]
 """Called with the stage, what of it is done, and all of it."""
 
 _SPARE = 1.25
-"""Positions that are drawn for each drop that is wanted, since some no station hears."""
+"""Positions drawn for each drop, because some are audible to no station."""
 
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "embreex", "trimesh", "h5py")
 
@@ -87,7 +87,7 @@ def evaluate_site(
     Raises
     ------
     RayfixError
-        When the site, its scene or the table cannot be used, no station hears any place, or the folder cannot be
+        When the site, its scene or the table cannot be used, no drop is audible to any station, or the folder cannot be
         written.
     """
     work = folder / "work"
@@ -180,17 +180,17 @@ class _Runner:
         return self.store.get(key)
 
     def drops(self) -> dict[str, Any]:
-        """Numbers of the drops that a station hears, and what they are like.
+        """Numbers of the drops that are audible to a station, and their statistics.
 
         Raises
         ------
         RayfixError
-            When no station hears any place.
+            When no drop is audible to any station.
         """
         found: dict[str, Any] = self.stored("finding paths to drops", {}, self._find_drops)
         if not found["heard"]:
             raise RayfixError(
-                f"no station hears any of {self.settings.drops} places; check the stations' positions and "
+                f"none of {self.settings.drops} drops is audible to a station; check the stations' positions and "
                 "max_path_length_m"
             )
         return found
@@ -253,7 +253,7 @@ class _Runner:
             for method in point.methods:
                 run = Run.of_document(self._content(study, point.case, method, heard)["run"])
                 methods[method] = {**summarise(run, self.settings.seed), "error_m": run.document()["error_m"]}
-            # The bound, and what is heard, are the same for all methods of a point.
+            # The bound and the audible paths are the same for all methods of a point.
             points.append(
                 {
                     "label": point.label,

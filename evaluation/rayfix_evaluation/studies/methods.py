@@ -95,7 +95,7 @@ class Method:
     Attributes
     ----------
     key, label : str
-        In files and for people.
+        In files, and for display.
     note : str
         One sentence on what it does and knows.
     variant : str
@@ -199,7 +199,7 @@ _OURS = (
     Method(
         key="rayfix-uniform",
         label="rayfix, uniform prior",
-        note="The same with a table without the path-selection prior: any path of a place is as likely as another.",
+        note="The same with a table without the path prior: all paths from a position are equally likely.",
         variant="uniform",
         calibrated=True,
         make=_rayfix("uniform"),
@@ -207,7 +207,7 @@ _OURS = (
     Method(
         key="rayfix-paper",
         label="rayfix, paper's prior",
-        note="The same with a table that weighs points along a ray alike, as the paper does.",
+        note="The same with a table that weights all points along a ray equally, as the paper does.",
         variant="paper",
         calibrated=True,
         make=_rayfix("paper"),
@@ -222,7 +222,7 @@ _OURS = (
     Method(
         key="paper-table",
         label="paper's method, plain table",
-        note="Mixtures of the nearest cells, no correction for the angle within a cell, product, arg max.",
+        note="Mixtures of the nearest cells without correction for the angle within a cell, product, arg max.",
         variant="paper",
         timings=frozenset(["none", "pt"]),
         weight=10.0,
@@ -234,15 +234,15 @@ _RIVALS = (
     Method(
         key="planar",
         label="2D predecessor, true height",
-        note="Rays of the angles cross the plane of the transmitter's height, which it is told exactly; 2D mixtures, "
-        "product. Times are left.",
+        note="Rays of the angles are intersected with the plane of the transmitter's exactly known height; 2D "
+        "mixtures, product. Times are not used.",
         weight=10.0,
         make=_planar,
     ),
     Method(
         key="reverse-rays",
         label="noise-free reverse rays",
-        note="One mirrored ray for each measured angle; where they meet. Times are left.",
+        note="One reflected ray for each measured angle, and the point nearest to all. Times are not used.",
         weight=3.0,
         make=_reverse_rays,
     ),
@@ -260,7 +260,7 @@ _RIVALS = (
     Method(
         key="fingerprints",
         label="k-NN fingerprints",
-        note="The places of a simulated map whose strongest paths are most like the report.",
+        note="Weighted mean of the points of a simulated map whose strongest paths are most similar to the report.",
         needs_map=True,
         make=_fingerprints,
     ),
@@ -270,7 +270,7 @@ _FEWER = tuple(
     Method(
         key=f"rayfix-fewer-{n}",
         label=f"rayfix, {n} fewer reflections",
-        note=f"With a table that follows rays over {n} reflections fewer than the site file says.",
+        note=f"With a table of {n} reflections fewer than in the site file.",
         variant=f"fewer-{n}",
         calibrated=True,
         compared=False,

@@ -37,7 +37,7 @@ def draw_pictures(bench: Bench, heard: Sequence[int], seed: int) -> dict[str, An
     Parameters
     ----------
     heard : sequence of int
-        Numbers of drops that a station hears. The pictures show the one of the first 60 that most stations hear, and of
+        Numbers of the audible drops. The pictures show the one of the first 60 that is audible to most stations, and of
         these one that as few as possible, but one at least, see directly.
 
     Returns
@@ -133,7 +133,7 @@ def _differences(clouds: dict[str, RayPoints], ranges: dict[str, tuple[float, fl
         return None
     first, second = list(clouds)[:2]
     stdev = 0.5
-    # Rows and columns at even steps of length about what was measured, so that the band of agreement runs through.
+    # Rows and columns at uniform steps of length around the measured one, so that the band of agreement is in view.
     rows, columns = (ranges[name][0] + np.linspace(-2.0, 2.0, _ROWS) for name in (first, second))
     lengths = []
     for name, wanted in ((first, rows), (second, columns)):

@@ -1,7 +1,7 @@
 """The paper's method from a plain table: nearest cell, no correction for the angle within it.
 
 The table is one of the paper's path prior. A station's mixture is that of the cell around its angle, of the level whose
-window is nearest to the stated deviation; what the angle says beyond the number of its cell is not used. A propagation
+window is nearest to the stated standard deviation; the offset of the angle within its cell is not used. A propagation
 time conditions the stored mixture over (position, path length), the paper's Algorithm 1 with its steps 3 and 4
 exchanged; then the stations' mixtures are multiplied and the arg max is taken, as in the paper. Algorithm 2 needs
 points and has no such form, so relative times are refused.
@@ -26,7 +26,7 @@ _MOST_PRODUCTS = 1_000
 """Products of components that are kept after each station."""
 
 _LEAST_WEIGHT = 1e-6
-"""Components that weigh less than this share of their mixture's heaviest are left out."""
+"""Components whose weight is below this fraction of the largest in their mixture are left out."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -53,7 +53,7 @@ def _document(plan: PlanMap) -> dict[str, Any]:
         "position_m": np.round(plan.position[:, :2], 3).tolist(),
         "error_m": _numbers(plan.error),
         "within": _numbers(plan.within),
-        "heard": _numbers(plan.num_heard),
+        "heard": _numbers(plan.num_audible),
     }
 
 

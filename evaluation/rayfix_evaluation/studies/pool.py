@@ -127,7 +127,7 @@ def _gathered(parallel: Parallel, tasks: Sequence[Task], advance: Callable[[str,
 
 
 def end_with(process: int) -> None:
-    """End this process when its parent has ended, however that was: nobody waits for its results then.
+    """End this process when its parent has ended, in whatever way: its results have no receiver then.
 
     Parameters
     ----------

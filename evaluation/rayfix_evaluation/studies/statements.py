@@ -11,10 +11,10 @@ from rayfix_evaluation.studies.summary import Run, percentile, probability_lower
 __all__ = ["Statement", "check_statements"]
 
 _STRONGLY = 0.5
-"""What helps strongly brings the 90th percentile to this share or less."""
+"""A strong improvement reduces the 90th percentile to this fraction or less."""
 
 _SURE = 0.95
-"""Share of bootstrap resamples that have to agree before something is said to hold or not."""
+"""Fraction of bootstrap resamples that must agree before a difference counts as certain."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,13 +68,13 @@ def _propagation_times_help(runs: Mapping[tuple[str, str, str], Run], method: st
     reason = ""
     if not holds:
         reason = (
-            "Which of several places along a ray it was, times tell the paper's method and the path-selection prior "
-            "tells rayfix already, so there is less left for times to do."
+            "In the paper's method, times resolve the ambiguity along a ray; in rayfix the path prior already does, so "
+            "that times add less."
             if method == "rayfix"
-            else "Reports without times are seldom ambiguous here: rays of the stations cross but once."
+            else "Reports without times are seldom ambiguous here: the rays of the stations intersect only once."
         )
     return Statement(
-        claim="Propagation times help strongly at 1 deg.",
+        claim="Propagation times improve the accuracy strongly at 1 deg.",
         method=method,
         holds=holds,
         figures=f"90th percentile {_cm(before)} without, {_cm(after)} with PT 0.5 m; lower in {share:.0%} of "
@@ -93,7 +93,9 @@ def _time_noise_matters_less(runs: Mapping[tuple[str, str, str], Run], method: s
         holds=holds,
         figures=f"90th percentile {_cm(angle[0])} to {_cm(angle[1])} (x {_ratio(angle):.1f}) from 0.25 to 1 deg; "
         f"{_cm(time[0])} to {_cm(time[1])} (x {_ratio(time):.1f}) from 0.2 to 1 m",
-        reason="" if holds else "Times of 0.2 m are as good as the angles at these distances, so losing them shows.",
+        reason=""
+        if holds
+        else "At these distances, times of 0.2 m are as accurate as the angles, so that their noise matters.",
     )
 
 
@@ -112,16 +114,16 @@ def _relative_times_help_less(runs: Mapping[tuple[str, str, str], Run], method: 
     reason = ""
     if not holds:
         reason = (
-            "The two are within the scatter of each other; RPT 0.5 m comes of times that are better than PT 0.5 m by a "
-            "factor of the square root of two."
+            "The difference is within the sampling scatter; RPT 0.5 m comes from times that are more accurate than PT "
+            "0.5 m by the square root of two."
             if share > 1.0 - _SURE
-            else "A difference says of two stations at once which of their paths belong together, which rayfix uses in "
-            "full; and RPT 0.5 m comes of times that are better than PT 0.5 m, by a factor of the square root of two."
+            else "A difference constrains the pair of paths of two stations jointly, which rayfix uses in full; and "
+            "RPT 0.5 m comes from times that are more accurate than PT 0.5 m by the square root of two."
         )
     elif share < _SURE:
-        reason = "The two are within the scatter of each other."
+        reason = "The difference is within the sampling scatter."
     return Statement(
-        claim="Relative propagation times help less than propagation times.",
+        claim="Relative propagation times improve the accuracy less than propagation times.",
         method=method,
         holds=holds,
         figures=f"90th percentile {_cm(values[0])} with angles of 1 deg alone, {_cm(values[1])} with RPT 0.5 m, "
@@ -131,7 +133,7 @@ def _relative_times_help_less(runs: Mapping[tuple[str, str, str], Run], method: 
 
 
 def _ahead(runs: Mapping[tuple[str, str, str], Run], seed: int) -> Statement:
-    """Rayfix below the paper's method at every noise of every figure of the paper."""
+    """Check rayfix against the paper's method at every noise of every figure of the paper."""
     behind, unsure, count = [], [], 0
     for study, point, method in runs:
         if method != "paper" or not study.startswith("cdf-"):
@@ -146,14 +148,14 @@ def _ahead(runs: Mapping[tuple[str, str, str], Run], seed: int) -> Statement:
                 unsure.append(name)
     figures = f"{count - len(behind)} of {count} percentiles are lower"
     if unsure:
-        figures += f", {len(unsure)} of them within the scatter"
+        figures += f", {len(unsure)} of them within the sampling scatter"
     return Statement(
-        claim="rayfix is ahead of the paper's method at every noise, at the 50th and the 90th percentile, on the same "
-        "drops.",
+        claim="rayfix has smaller errors than the paper's method at every noise, at the 50th and the 90th percentile, "
+        "on the same drops.",
         method="rayfix",
         holds=not behind,
         figures=figures,
-        reason=f"Not ahead at: {'; '.join(behind)}." if behind else "",
+        reason=f"Exceptions: {'; '.join(behind)}." if behind else "",
     )
 
 

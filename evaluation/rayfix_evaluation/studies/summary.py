@@ -124,7 +124,7 @@ def summarise(run: Run, seed: int) -> dict[str, Any]:
 
 
 def probability_lower(one: Run, other: Run, percent: float, seed: int) -> float:
-    """Share of resamples, of the same drops for both, in which the one's percentile is below the other's."""
+    """Fraction of joint resamples of the drops in which one run's percentile is below the other's."""
     return float(np.mean(resampled(one.error, percent, seed) < resampled(other.error, percent, seed)))
 
 

@@ -32,21 +32,21 @@ def test_forecast_errors_are_those_that_are_measured(screen_table: Table, timing
     _, places = draw_places(screen_table, 1.1, 0.7, 8, np.random.default_rng(5))
     drops = [drop for drop in drops_at(places, solver_of(screen_table), screen_table.site.stations) if drop.paths]
     error = locate_drops(Locator(screen_table), drops, NOISE, timing=timing, rng=np.random.default_rng(6)).error
-    # Squares where one station alone is heard have no fix without times, or a poor one.
-    usual, told = np.median(error), np.median(plan.error)
-    assert usual == pytest.approx(told, rel=0.25)
+    # Squares where one station alone is audible have no fix without times, or a poor one.
+    usual, predicted = np.median(error), np.median(plan.error)
+    assert usual == pytest.approx(predicted, rel=0.25)
     assert np.mean(error < 0.15) == pytest.approx(plan.coverage, abs=0.06)
 
 
-def test_stations_that_are_heard_are_counted(screen_table: Table, plan: PlanMap) -> None:
-    assert plan.heard.shape == (len(plan), 3)
+def test_audible_stations_are_counted(screen_table: Table, plan: PlanMap) -> None:
+    assert plan.audible.shape == (len(plan), 3)
     corner = np.argmin(np.linalg.norm(plan.position[:, :2] - [0.25, 0.25], axis=1))
     # Behind the screen for b; c sees over its end.
-    assert plan.heard[corner].tolist() == [1.0, 0.0, 0.0]
+    assert plan.audible[corner].tolist() == [1.0, 0.0, 0.0]
     top = np.argmin(np.linalg.norm(plan.position[:, :2] - [2.25, 4.75], axis=1))
-    assert plan.num_heard[top] == 3.0
-    # Where fewer are heard, errors are larger.
-    assert np.median(plan.error[plan.num_heard < 1.5]) > 1.2 * np.median(plan.error[plan.num_heard > 2.5])
+    assert plan.num_audible[top] == 3.0
+    # Where fewer are audible, errors are larger.
+    assert np.median(plan.error[plan.num_audible < 1.5]) > 1.2 * np.median(plan.error[plan.num_audible > 2.5])
 
 
 def test_bounds_are_below_the_errors_and_grow_with_the_noise(screen_table: Table, plan: PlanMap) -> None:
@@ -68,7 +68,7 @@ def test_forecasts_repeat(screen_table: Table, plan: PlanMap) -> None:
 def test_one_station_without_times_leaves_a_direction_open(fewer_path: Path) -> None:
     table = Table.open(fewer_path)
     angles = forecast(table, replace(SETTINGS, timing="none"))
-    alone = angles.heard.sum(axis=1) == 1.0
+    alone = angles.audible.sum(axis=1) == 1.0
     assert alone.sum() > 10
     assert np.isinf(angles.bound[alone]).all()
     assert np.isfinite(forecast(table, SETTINGS).bound[alone]).all()
@@ -98,7 +98,7 @@ def test_a_floor_without_free_places_is_refused(screen_table: Table) -> None:
         ({"threshold": float("nan")}, r"the threshold is nan m; it must be positive"),
         ({"height": float("inf")}, r"the height is inf m; give the transmitters' z in the scene"),
         ({"draws": 0}, r"the number of draws is 0; give 1 or more"),
-        ({"noise": replace(NOISE, range_stdev=None)}, r"the timing is 'pt', but the deviation of a range is not given"),
+        ({"noise": replace(NOISE, range_stdev=None)}, r"the timing is 'pt', but the standard deviation of a range"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(changed: dict[str, object], message: str) -> None:
@@ -139,7 +139,7 @@ def test_changes_are_by_square(plan: PlanMap) -> None:
         position=plan.position[:40],
         error=2.0 * plan.error[:40],
         within=plan.within[:40] - 0.1,
-        heard=plan.heard[:40],
+        audible=plan.audible[:40],
         bound=plan.bound[:40],
     )
     ratio, gain = changes(plan, half)
@@ -150,7 +150,7 @@ def test_changes_are_by_square(plan: PlanMap) -> None:
 
 
 def test_pictures_are_drawn(screen_table: Table, plan: PlanMap, fewer_path: Path, tmp_path: Path) -> None:
-    lost = replace(plan, error=np.where(plan.num_heard < 2.0, np.inf, plan.error))
+    lost = replace(plan, error=np.where(plan.num_audible < 2.0, np.inf, plan.error))
     draw_plan(tmp_path / "one.png", screen_table, lost)
     assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
     fewer = Table.open(fewer_path)

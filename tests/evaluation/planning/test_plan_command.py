@@ -27,7 +27,7 @@ def test_a_map_is_drawn_and_told(capsys: pytest.CaptureFixture[str], screen_path
     assert main(command) == 0
     out, err = capsys.readouterr()
     assert out.startswith("abc.h5: ")
-    assert "stations heard" in out
+    assert "audible stations" in out
     assert err == ""
 
 

@@ -101,6 +101,8 @@ NOT_IN_IDENTITY = {
     "offline.job.plan.BLOCK_CELLS": "a shard of other cells is not taken; the table has no blocks",
     "offline.job.plan.WIDE_BLOCK_CELLS": "a shard of other cells is not taken; the table has no blocks",
     "offline.job.shards._DIGEST_BYTES": DEFINITION,
+    "offline.job.shards._FOLDER": "how a folder is opened",
+    "offline.job.shards._REMOVAL_SECONDS": SAME_BITS,
     "tables.gaussians.conditioning.LOG_2PI": DEFINITION,
     "tables.gaussians.normal_points.unit_points": "used by the service only",
     "tables.level.WINDOW_RATIO": "the default of window_ratio in CoarseFit and BalanceSettings",
