@@ -12,7 +12,7 @@ The public API is what ``__all__`` of this package and of :mod:`rayfix.client` n
   (``Measurement`` is any of them), ``Height``, ``ErrorModel``, ``GAUSSIAN``, ``HEAVY_TAILED``, ``Frame``, and the
   functions ``range_from_...`` with their results ``RangeEstimate`` and ``LogRangeEstimate``;
 - the fusion and its answer: ``Locator``, ``FusionSettings``, ``Fix``, ``Status``, ``Candidate``, ``Outcome``,
-  ``CredibleRegions``, ``Posterior``, ``Fused``;
+  ``CredibleRegions``, ``Posterior``, ``Fused``; ``Stop`` ends a fix early, by ``FixStoppedError``;
 - tracks: ``Tracker``, ``TrackingSettings``, ``MotionModel``, ``TrackedPosition``, ``TrackState``, ``Estimate``;
 - a service over the network: ``Client``, ``AsyncClient``, ``RetryPolicy``;
 - the errors, drawn as a tree in :mod:`rayfix.errors`.

@@ -1,7 +1,7 @@
-"""The offline job: a site file and its scene become a table.
+"""The offline job: build the table of a site file and its scene.
 
-Finished blocks of cells go to shards beside the table to be, so that a build that was interrupted or killed goes on
-where it was; stations and cells of a former table that are still right are taken from there.
+Finished blocks of cells are saved in shards beside the table, so that an interrupted or killed build continues where it
+ended. Stations and cells of a former table that are still valid are taken from there.
 """
 
 import resource
@@ -30,25 +30,25 @@ from rayfix_tables.version import software_version
 from rayfix_tables.write import SceneContent, StationContent, check_writable, write_table
 
 Progress = Callable[[str, int, int], None]
-"""Called with the stage, the cells that are done and the cells that there are in all (0 while not yet known)."""
+"""Called with the stage, the number of cells that are done and their total number (0 while it is unknown)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StationSummary:
-    """What the build made of one station.
+    """Result of a build for one station.
 
     Attributes
     ----------
     origin : {"built", "resumed", "updated", "kept"}
-        Built now; some blocks came from shards; some cells came from the former table; the whole part did.
+        Built now; some blocks from shards; some cells from the former table; the whole part from there.
     num_finest_cells : int
-        Cells of the finest level, which are fitted to rays; the others are sums of them.
+        Number of cells of the finest level, which are fitted to rays; the others are sums of them.
     num_kept_cells : int
-        Finest cells that came from the former table.
+        Number of finest cells from the former table.
     largest_change : float
-        By how much of its mass the measure of a kept cell has changed at most; 0 in an exact table.
+        Largest change of the measure of a kept cell, as a fraction of its mass; 0 in an exact table.
     num_dropped_components : int
-        Components that were left out with their weight, because they had no positive definite covariance.
+        Number of components dropped with their weight for want of a positive definite covariance.
     """
 
     station_id: str
@@ -67,12 +67,12 @@ class StationSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class BuildSummary:
-    """What the build made.
+    """Result of a build.
 
     Attributes
     ----------
     peak_bytes : int
-        Most memory that the process has held.
+        Peak memory of the process.
     """
 
     path: Path
@@ -94,38 +94,38 @@ def build_table(
     tolerance: float = 0.0,
     progress: Progress | None = None,
 ) -> BuildSummary:
-    """Build a site's table, or what of it is missing or has changed.
+    """Build a site's table, or those parts of it that are missing or have changed.
 
     Parameters
     ----------
     table_path : str or Path
-        Where the table goes. A former table there is replaced when the new one is whole.
+        Path of the table. A former table there is replaced when the new one is complete.
     jobs : int
-        Cells that are fitted at a time; -1 for one per core.
+        Number of cells that are fitted at a time; -1 for one per core.
     cluster : str, optional
-        Address of a Dask scheduler, whose workers then fit the cells.
+        Address of a Dask scheduler whose workers fit the cells.
     former : str or Path, optional
-        Table from which whatever still holds is taken; one at ``table_path`` when left out.
+        Table whose valid parts are reused; by default the one at ``table_path``, if there is one.
     tolerance : float
-        Share of a cell's mass that may have changed before the cell is fitted again. With 0, the table is that of a
-        whole build; with more, its updated stations say how far each of their cells may be from that.
+        Fraction of a cell's mass that may have changed before the cell is fitted again. With 0, the table equals that
+        of a new build; otherwise updated stations have a bound on the difference for each of their cells.
     progress : callable, optional
-        Called as the build goes on.
+        Called repeatedly.
 
     Raises
     ------
     SiteError, SceneError
         When the site or its scene cannot be used.
     BuildError
-        When the tolerance is no share, no ray finds anything, the cluster fails, or the disk is full; finished blocks
-        stay for the next run.
+        When the tolerance is not in [0, 1), no ray reaches free space, the cluster fails, or the disk is full. Finished
+        blocks remain for the next run.
     TableError
-        When ``former`` cannot be read or the table cannot be written. No partial table is left, and a former one stays
-        as it was.
+        When ``former`` cannot be read or the table cannot be written. No partial table is left, and a former one is not
+        changed.
     """
     begin = time.perf_counter()
     if not 0.0 <= tolerance < 1.0:
-        raise BuildError(f"a tolerance of {tolerance:g} is no share of a cell's mass; give 0 or more, below 1")
+        raise BuildError(f"a tolerance of {tolerance:g} is no fraction of a cell's mass; give 0 or more, below 1")
     report = progress or (lambda stage, done, total: None)
     site_path, table_path = Path(site_path), Path(table_path)
     site = read_site(site_path)
@@ -196,9 +196,9 @@ def _build_stations(
 
 
 def _balanced(stations: list[BuiltStation], job: Job) -> list[BuiltStation]:
-    """Balance all levels, if their prior makes the probabilities of the paths to a place add up to 1.
+    """Normalise all levels, if the path prior is one whose probabilities add up to 1 at each position.
 
-    A part that was kept whole is of the same free space, so that its balance holds.
+    A part that was kept as a whole belongs to the same free space, so that it remains valid.
     """
     if job.site.propagation.path_prior != "power":
         return stations
@@ -216,13 +216,13 @@ def _balanced(stations: list[BuiltStation], job: Job) -> list[BuiltStation]:
 
 
 def _keeps_balance(station: BuiltStation) -> bool:
-    """Whether a station's part comes from a former table, balanced; tables of early versions are not."""
+    """Whether a station's part is taken from a former table that is normalised; those of early versions are not."""
     levels = station.content.levels
     return station.origin == "kept" and all(len(level.log_balance) == len(level.mixture) for level in levels)
 
 
 def _start_engine(cluster: str | None, job: Job) -> AbstractContextManager[FittingEngine]:
-    """Connect to a cluster, if one is named; only this needs Dask."""
+    """Return the local engine, or connect to a cluster; only that needs Dask."""
     if cluster is None:
         return nullcontext(LocalEngine(job))
     try:
@@ -248,7 +248,7 @@ def _dropped_warnings(stations: tuple[StationSummary, ...]) -> Iterator[str]:
         if station.num_dropped_components:
             yield (
                 f"{station.num_dropped_components} components of station '{station.station_id}' have no positive "
-                "definite covariance and are left out with their weight; they are of paths of next to no probability: "
+                "definite covariance and are dropped with their weight; their paths have very small probabilities: "
                 "lower path_prior_exponent if they matter"
             )
 
@@ -283,5 +283,5 @@ def _summary(station_id: str, built: BuiltStation) -> StationSummary:
 
 
 def _after(before: int, total: int, report: Progress) -> StationProgress:
-    """Return the progress of a station that comes after this many cells."""
+    """Return the progress callback of a station that follows this many cells."""
     return lambda stage, done: report(stage, before + done, total)

@@ -1,4 +1,4 @@
-"""``rayfix check``: everything that is wrong with a site and its scene, at once."""
+"""``rayfix check``: all problems of a site and its scene."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,18 +9,18 @@ from rayfix_offline.site import read_site
 from rayfix_offline.twin.findings import Finding
 from rayfix_offline.twin.twin import Twin, prepare_twin
 
-NOTABLE_SHARE = 0.05
-"""A place that at least this share of the escaping rays pass is named."""
+NOTABLE_FRACTION = 0.05
+"""The position where most rays leave is named if at least this fraction of the lost rays leave there."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """What the check of a site found.
+    """Result of a check.
 
     Attributes
     ----------
     escapes : tuple of Escapes
-        One for each station that is where a station can be.
+        One for each station at a valid position.
     """
 
     site_path: Path
@@ -30,7 +30,7 @@ class Check:
 
     @property
     def num_errors(self) -> int:
-        """Findings that stop a build."""
+        """Number of findings that stop a build."""
         return sum(finding.severity == "error" for finding in self.findings)
 
     def document(self) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def check_site(site_path: Path) -> Check:
 
 def _hole(escapes: Escapes, twin: Twin) -> Finding:
     where = f"{escapes.side_share:.0%} of them towards {escapes.side}"
-    if escapes.place is not None and escapes.place_share > NOTABLE_SHARE:
+    if escapes.place is not None and escapes.place_share > NOTABLE_FRACTION:
         at = ", ".join(f"{v:.1f}" for v in escapes.place)
         where += f", {escapes.place_share:.0%} near ({at}) m"
     return Finding(

@@ -1,4 +1,4 @@
-"""The site file: what to build, where the stations are, how waves travel there."""
+"""The site file: scene, propagation, table settings and stations."""
 
 import re
 import tomllib
@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from rayfix_tables.errors import SiteError
 from rayfix_tables.site import SiteInfo, Station, StationBias
 
-LEAST_WINDOW_RATIO = 1.5
-"""A window is at least this many times the one before it: its cells are sums, which must be flat, of those."""
+MIN_WINDOW_RATIO = 1.5
+"""Smallest ratio of a window to the one before: its cells are sums of finer cells, which must add up to its window."""
 
 LARGEST_COORDINATE = 5e7
 """m; maps have coordinates of up to 2e7 m, and single precision tells no walls apart far beyond."""
@@ -46,7 +46,7 @@ class SiteSection(_Section):
 
 
 class PropagationSection(_Section):
-    """``[propagation]``: which paths there are and which of them a station reports."""
+    """``[propagation]``: the paths, and which of them a station reports."""
 
     carrier_ghz: Annotated[float, Field(gt=0, le=1000)] = 3.5
     max_reflections: Annotated[int, Field(ge=0, le=8)] = 3
@@ -58,7 +58,7 @@ class PropagationSection(_Section):
 
 
 class TableSection(_Section):
-    """``[table]``: how finely the table is cut."""
+    """``[table]``: windows and fit of the table."""
 
     windows_deg: tuple[Annotated[float, Field(ge=0.1, le=30)], ...] = (1.25, 5.0, 15.0)
     fit: Literal["tubes", "em"] = "tubes"
@@ -68,16 +68,16 @@ class TableSection(_Section):
     def _windows_ascend(self) -> "TableSection":
         if not self.windows_deg:
             raise ValueError("windows_deg must name at least one window, e.g. [1.25, 5.0, 15.0]")
-        if any(b < LEAST_WINDOW_RATIO * a for a, b in zip(self.windows_deg, self.windows_deg[1:], strict=False)):
+        if any(b < MIN_WINDOW_RATIO * a for a, b in zip(self.windows_deg, self.windows_deg[1:], strict=False)):
             raise ValueError(
-                f"windows_deg must grow to at least {LEAST_WINDOW_RATIO:g} times from each window to the next, "
+                f"windows_deg must grow to at least {MIN_WINDOW_RATIO:g} times from each window to the next, "
                 "e.g. [1.25, 5.0, 15.0]"
             )
         return self
 
 
 class BiasSection(_Section):
-    """``[stations.bias]``: what a station measures wrongly each time, measured minus true."""
+    """``[stations.bias]``: systematic errors of a station, measured minus true."""
 
     range_m: Annotated[float, Field(ge=-10_000, le=10_000)] = 0.0
     range_stdev_m: Annotated[float, Field(ge=0, le=10_000)] = 0.0
@@ -96,7 +96,7 @@ class StationSection(_Section):
     bias: BiasSection = BiasSection()
 
     def built_from(self) -> dict[str, Any]:
-        """Return what the station's part of the table depends on: all but the bias, which the fusion takes off."""
+        """Return what the station's part of the table depends on: all but the bias, which the fusion subtracts."""
         return self.model_dump(mode="json", exclude={"bias"})
 
 
@@ -119,7 +119,7 @@ class SiteFile(_Section):
         return self
 
     def info(self) -> SiteInfo:
-        """Return what the table keeps of the site."""
+        """Return the site as the table stores it."""
         return SiteInfo(
             name=self.site.name,
             north=float(np.deg2rad(self.site.north_deg)),
@@ -180,7 +180,7 @@ def parse_site(document: dict[str, Any], *, source: str = "site") -> SiteFile:
     Parameters
     ----------
     source : str
-        How messages call the file.
+        Name of the file in messages.
 
     Raises
     ------

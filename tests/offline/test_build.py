@@ -110,7 +110,7 @@ def test_dropped_components_are_counted(site_path: Path, tmp_path: Path, monkeyp
     counts = {s.station_id: s.num_dropped_components for s in summary.stations}
     assert counts == {s.station_id: s.num_finest_cells for s in summary.stations}
     for station_id, count in counts.items():
-        told = f"{count} components of station '{station_id}' have no positive definite covariance and are left out"
+        told = f"{count} components of station '{station_id}' have no positive definite covariance and are dropped"
         assert any(told in warning for warning in summary.warnings)
 
 

@@ -1,4 +1,4 @@
-"""Cells that have been fitted: the result of a block, and what becomes of blocks in a shard and in a level."""
+"""Fitted cells: the result of a block, and its conversion to a shard and to a level."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,8 @@ class FittedCells:
         Components of each cell.
     log_mass : ndarray of shape (n_cells,)
     change : ndarray of float32, shape (n_cells,)
-        Bound on the change of the cell's measure since it was fitted, as a share of its mass; 0: fitted to this scene.
+        Bound on the change of the cell's measure since it was fitted, as a fraction of its mass; 0 if it was
+        fitted to this scene.
     dropped : ndarray of int64, shape (n_cells,)
         Components of each cell that were dropped, see :class:`~rayfix_offline.fit.tubes.Fitted`; 0 for one of a table.
     mixture : TubeMixture
@@ -55,7 +56,7 @@ class FittedCells:
             log_mass=level.cell_log_mass[cells],
             change=change.astype(np.float32),
             dropped=np.zeros(len(cells), np.int64),
-            mixture=level.mixture[_places(level.cell_offsets[cells], counts)],
+            mixture=level.mixture[_ranges(level.cell_offsets[cells], counts)],
         )
 
     def joined(self, other: "FittedCells") -> "FittedCells":
@@ -71,23 +72,23 @@ class FittedCells:
             log_mass=np.concatenate([self.log_mass, other.log_mass])[order],
             change=np.concatenate([self.change, other.change])[order],
             dropped=np.concatenate([self.dropped, other.dropped])[order],
-            mixture=mixture[_places(starts[order], counts[order])],
+            mixture=mixture[_ranges(starts[order], counts[order])],
         )
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a shard."""
+        """Return the arrays of a shard."""
         columns = {name: getattr(self, name) for name in _COLUMNS}
         return columns | {name: getattr(self.mixture, name) for name in FIELD_SHAPES}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> "FittedCells":
-        """Take up what :meth:`to_arrays` gave."""
+        """Return the cells whose :meth:`to_arrays` gave these arrays."""
         mixture = TubeMixture(**{name: arrays[name] for name in FIELD_SHAPES})
         return cls(**{name: arrays[name] for name in _COLUMNS}, mixture=mixture)
 
 
-def _places(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers from each start on, as many as its count, one after another."""
+def _ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Concatenate ranges, given by their starts and lengths."""
     ends = np.cumsum(counts)
     return np.repeat(starts - (ends - counts), counts) + np.arange(counts.sum())
 
@@ -129,7 +130,7 @@ def assemble_level(window: float, grid: AngularGrid, parts: Sequence[FittedCells
     ----------
     window : float, rad
     parts : sequence of FittedCells
-        In the order of their cells; cells that are in none stay empty.
+        In the order of their cells; cells that are in no part remain empty.
     """
     counts = np.zeros(grid.num_cells, np.int64)
     log_mass = np.full(grid.num_cells, -np.inf)

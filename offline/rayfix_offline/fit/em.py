@@ -1,7 +1,7 @@
 """``fit = "em"``: cells fitted by expectation-maximisation on sampled points, as in the paper.
 
-Points are drawn from a cell's weighted ray pieces and a full-covariance Gaussian mixture is fitted to them jointly over
-(path length, angles, position); the number of components is the one with the least BIC.
+Points are drawn from the weighted ray pieces of a cell. A Gaussian mixture with full covariances is fitted to their
+path length, angles and position; its number of components has the least BIC.
 """
 
 import warnings
@@ -64,7 +64,7 @@ def sample_points(
     Returns
     -------
     points : ndarray of shape (count, 6)
-        (path length, horizontal and vertical angle, x, y, z); none where no ray comes.
+        (path length, horizontal and vertical angle, x, y, z); none if no ray reaches the cell.
     num_reflections : ndarray of int8, shape (count,)
     mass : float
         The cell's mass.
@@ -87,7 +87,7 @@ def sample_points(
     if mass <= 0.0:
         return np.zeros((0, 6)), np.zeros(0, np.int8), 0.0
     drawn = rng.choice(len(weight), size=count, p=weight / mass)
-    # A ray stands for a patch of directions and a piece for a stretch of lengths.
+    # A ray represents a solid angle, and a piece an interval of lengths.
     half = np.sqrt(3.0 * chosen.variance[drawn])
     length = chosen.mean[drawn] + half * rng.uniform(-1.0, 1.0, count)
     jitter = rng.uniform(-0.5, 0.5, (count, 2)) * level.ray_spacing
@@ -111,8 +111,8 @@ def _fit_points(
     fit: ExpectationMaximisation,
     seed: int,
 ) -> Fitted:
-    """Fit one cell of a mass."""
-    scale = np.maximum(points.std(axis=0), fit.least_scale)
+    """Fit one cell."""
+    scale = np.maximum(points.std(axis=0), fit.min_scale)
     scaled = (points - points.mean(axis=0)) / scale
     best: tuple[float, GaussianMixture] | None = None
     for num_components in fit.num_components:
@@ -120,7 +120,7 @@ def _fit_points(
             num_components, reg_covar=fit.regularisation, random_state=seed, max_iter=fit.max_rounds
         )
         with warnings.catch_warnings():
-            # A mixture that has not settled after the last round is judged by its BIC like any other.
+            # A mixture that has not converged after the last round is judged by its BIC like any other.
             warnings.simplefilter("ignore", ConvergenceWarning)
             mixture.fit(scaled)
         bic = float(mixture.bic(scaled))
@@ -141,13 +141,13 @@ def _fit_points(
     found = fitted_cells(
         np.array([len(chosen.weights_)]),
         np.array([log_mass]),
-        np.log(np.maximum(chosen.weights_, fit.least_weight)),
+        np.log(np.maximum(chosen.weights_, fit.min_weight)),
         chosen.means_ * scale + points.mean(axis=0),
         cov,
         reflections,
         position_floor=fit.position_floor,
     )
-    # The floor of the length lies along the tube: the position moves with it.
+    # The floor of the length lies along the tube, so that it adds to u_cov only.
     u_cov = found.mixture.u_cov.copy()
     u_cov[:, 0] += fit.length_floor**2
     return found._replace(mixture=replace(found.mixture, u_cov=u_cov))

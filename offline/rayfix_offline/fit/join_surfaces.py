@@ -1,4 +1,4 @@
-"""Groups of a cell that belong to one curved surface become one, with the moments of all their points."""
+"""Groups of a cell on the same curved surface are joined, with the moments of all their points."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ def join_groups(
     cov: Any,
     mirror: Any,
 ) -> Any:
-    """Join the groups that have surface sequence and slice in common.
+    """Join the groups of the same surface sequence and slice.
 
     Parameters
     ----------
@@ -31,9 +31,9 @@ def join_groups(
     mass : ndarray of shape (m,)
     mean : ndarray of shape (m, d)
     cov : ndarray of shape (m, d, d)
-        Covariance within the groups and of their means.
+        Sum of the covariances within the groups and of their means.
     mirror : ndarray of shape (m, 3, 3)
-        Mean by mass: what a small change of the launch direction does to a place on average.
+        Mean, weighted by mass: the effect of a small change of the launch direction on the position.
     """
     count, size = mean.shape
     order = np.argsort(surface_sequence * (slices.max() + 1) + slices, kind="mergesort") if count else np.arange(0)
@@ -47,7 +47,7 @@ def join_groups(
             first[joined] = i
             joined += 1
         group[i] = joined - 1
-    # In the order in which the groups came, whatever the sequences' numbers: sums then do not depend on them.
+    # In the order of the input, so that later sums do not depend on the numbering of sequences.
     ranks = np.empty(joined, np.int64)
     ranks[np.argsort(first[:joined])] = np.arange(joined)
     group = ranks[group]
@@ -59,14 +59,14 @@ def join_groups(
     for i in range(count):
         out_mass[group[i]] += mass[i]
     for i in range(count):
-        share = mass[i] / out_mass[group[i]]
-        out_mean[group[i]] += share * mean[i]
-        out_mirror[group[i]] += share * mirror[i]
+        fraction = mass[i] / out_mass[group[i]]
+        out_mean[group[i]] += fraction * mean[i]
+        out_mirror[group[i]] += fraction * mirror[i]
     for i in range(count):
         g = group[i]
-        share = mass[i] / out_mass[g]
+        fraction = mass[i] / out_mass[g]
         for a in range(size):
             for b in range(size):
                 apart = (mean[i, a] - out_mean[g, a]) * (mean[i, b] - out_mean[g, b])
-                out_cov[g, a, b] += share * (cov[i, a, b] + apart)
+                out_cov[g, a, b] += fraction * (cov[i, a, b] + apart)
     return surface_sequence[first], out_mass, out_mean, out_cov, out_mirror

@@ -23,9 +23,9 @@ NUM_SUMS = 28
 
 @numba.njit(cache=True, nogil=True)
 def ring_span(azimuth: Any, reach: Any, cells: Any) -> Any:
-    """First step, and the one after the last, of those of a ring's cells that lie within a reach [rad] of an azimuth.
+    """First step, and the one after the last, of the cells of a ring within a reach [rad] of an azimuth.
 
-    Steps count from -pi and may be outside of the ring, to be taken modulo its cells.
+    Steps are counted from -pi and are to be taken modulo the number of cells.
     """
     half = reach / (2.0 * np.pi) * cells
     middle = (azimuth + np.pi) / (2.0 * np.pi) * cells
@@ -35,12 +35,12 @@ def ring_span(azimuth: Any, reach: Any, cells: Any) -> Any:
 
 
 class GatheredRays(NamedTuple):
-    """What cells gather, as the kernels read it.
+    """Rays, their pieces and sequences, as the kernels read them.
 
     Attributes
     ----------
     ring_offsets, ring_cells
-        Of the grid that has a ray in each of its cells; as in :class:`~rayfix_tables.grid.AngularGrid`.
+        Of the grid with a ray in each of its cells, as in :class:`~rayfix_tables.grid.AngularGrid`.
     azimuth, zenith, solid_angle, directions
         As in :class:`~rayfix_offline.rays.rays.RaySet`.
     offsets, sequence, slice, mass, mean, variance
@@ -66,7 +66,7 @@ class GatheredRays(NamedTuple):
 
 
 def gathered_rays(rays: RaySet, pieces: Pieces, sequences: Sequences) -> GatheredRays:
-    """Return what cells gather."""
+    """Return the arrays of rays, pieces and sequences."""
     return GatheredRays(
         ring_offsets=rays.grid.ring_offsets,
         ring_cells=rays.grid.ring_cells,
@@ -86,12 +86,12 @@ def gathered_rays(rays: RaySet, pieces: Pieces, sequences: Sequences) -> Gathere
 
 
 class _Groups(NamedTuple):
-    """Groups of a cell while they are summed up.
+    """Groups of a cell during summation.
 
     Attributes
     ----------
     rows : ndarray of int32, shape (n_sequences,)
-        Row of ``slots`` that a sequence has, -1 for none.
+        Row of ``slots`` of a sequence, -1 for none.
     slots : ndarray of int32, shape (capacity, n_slices)
         Group of a sequence and slice, -1 for none.
     keys : ndarray of int64, shape (capacity, 2)
@@ -115,10 +115,10 @@ def gather_groups(
     num_slices: Any,
     rows: Any,
 ) -> Any:
-    """Add up the weighted moments of one cell.
+    """Sum up the weighted moments of one cell.
 
     Of a ray with launch direction d and tangent angles a, a piece of path length L lies at ``image + mirror @ (L d)``.
-    So the moments of (L, a, L d) are those of L times products of a and d, which are the same for all its pieces.
+    The moments of (L, a, L d) are therefore those of L times products of a and d, which are the same for all pieces.
 
     Parameters
     ----------
@@ -128,9 +128,9 @@ def gather_groups(
         Rays are gathered within this many standard deviations.
     rays : GatheredRays
     num_slices : int
-        Slices are numbered below this.
+        Number of slices.
     rows : ndarray of int32, shape (n_sequences,)
-        Scratch, all -1; left so.
+        Scratch, all -1; restored.
 
     Returns
     -------
@@ -143,7 +143,7 @@ def gather_groups(
     keys = np.empty((64, 2), np.int64)
     sums = np.zeros((64, NUM_SUMS))
     count = np.int64(0)  # plain zeros would have _add_ray compiled once more, for constants
-    # Groups by slice, for the sequences that the cell has: all of a station's would be too many to keep a place for.
+    # Groups by slice, only for the sequences that occur in the cell: those of a whole station would be too many.
     slots = np.full((64, num_slices), -1, np.int32)
     num_rows = np.int64(0)
     sine = np.sin(centre_zenith)
@@ -196,8 +196,8 @@ def _add_ray(
 ) -> Any:
     """Add a ray's pieces to the sums of their groups, and return the numbers of groups and of sequences.
 
-    What is added is mass, mass x length and mass x length^2, times products of a and d. It is written out, so that
-    the products stay in the processor's registers for all pieces of the ray: in loops it takes three times as long.
+    The terms are mass, mass x length and mass x length^2 times products of a and d. The loops are unrolled by hand, so
+    that the products remain in registers for all pieces of the ray: that is three times as fast.
     """
     x, y, z = rays.directions[ray, 0], rays.directions[ray, 1], rays.directions[ray, 2]
     slots, keys, sums = groups.slots, groups.keys, groups.sums
@@ -267,20 +267,20 @@ def _to_moments(sums: Any, image: Any, mirror: Any, mean: Any, cov: Any) -> None
     raw[1, 1] = sums[3] / mass
     raw[1, 2] = sums[4] / mass
     raw[2, 2] = sums[5] / mass
-    place = 21 + 1
+    index = 21 + 1
     for i in range(3):
         first[3 + i] = sums[9 + i] / mass
         raw[1, 3 + i] = sums[12 + i] / mass
         raw[2, 3 + i] = sums[15 + i] / mass
         raw[0, 3 + i] = sums[19 + i] / mass
         for j in range(i, 3):
-            raw[3 + i, 3 + j] = sums[place] / mass
-            place += 1
+            raw[3 + i, 3 + j] = sums[index] / mass
+            index += 1
     for i in range(SIZE):
         for j in range(i, SIZE):
             raw[i, j] -= first[i] * first[j]
             raw[j, i] = raw[i, j]
-    # From the unfolded position L d to the real one, x = image + mirror @ (L d).
+    # From the unfolded position L d to the position x = image + mirror @ (L d).
     for i in range(3):
         mean[i] = first[i]
         mean[3 + i] = image[i]
@@ -310,7 +310,7 @@ def blur(
     length_floor: Any,
     position_floor: Any,
 ) -> None:
-    """Give a group the width of its rays: each stands for a patch of directions, and nothing is exact to a millimetre.
+    """Widen a group by the solid angle that its rays represent, and by the floors of the standard deviations.
 
     Parameters
     ----------
@@ -321,7 +321,7 @@ def blur(
         Of the group's reflection sequence.
     ray_spacing : float, rad
     length_floor, position_floor : float, m
-        Standard deviations that are added along and across the tube.
+        Standard deviations that are added along the tube and to the position.
     """
     sine = np.sin(centre_zenith)
     azimuth = centre_azimuth + mean[1] / sine
@@ -360,7 +360,7 @@ def blur(
 
 @numba.njit(cache=True, nogil=True)
 def _grown(array: Any, capacity: Any, filling: Any) -> Any:
-    """Copy rows into a larger array, in loops: an assignment of slices takes seconds to compile."""
+    """Copy rows into a larger array, in loops, because an assignment of slices takes seconds to compile."""
     larger = np.full((capacity, array.shape[1]), filling, array.dtype)
     for i in range(len(array)):
         for j in range(array.shape[1]):

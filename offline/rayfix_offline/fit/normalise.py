@@ -1,15 +1,15 @@
-"""Balance a level's components: at each place, the probabilities of its paths are to add up to 1.
+"""Normalise a level's components: at each position, the probabilities of its paths should add up to 1.
 
-Of a UE at x, a station reports one of the paths to x, so that what the level says of x, summed over all directions and
-lengths, is 1 wherever the station is heard. Its Gaussians are smooth where beams end, at walls and shadows, so that the
-sum, the place's *share*, is too small there and too large beside. Of one station that hardly matters; but a fusion
-multiplies, so that what four stations say of a place at a wall would be too small four times over, and the posterior
-too sure that the UE is in the middle of the room.
+For a UE at x, a station reports one of the paths to x. The level's density at x, integrated over all directions and
+lengths, is the *total probability* of x and should be 1 wherever the station is audible. Gaussians are smooth where
+beams end, at walls and shadow boundaries: the total is too small there and too large beside them. For one station this
+matters little. A fusion multiplies the densities of several stations: the error is raised to their number, and the
+posterior is biased towards the middle of the room.
 
-A component is raised by the mean of 1 / share over the free places that it covers. Then shares have changed, so that is
-repeated (the iteration of W. H. Richardson, "Bayesian-based iterative method of image restoration", J. Opt. Soc. Am.
-62 (1), 1972, with an even image). A round changes no component by more than a factor of two: where a share is much
-smaller, the station is not heard at all, and what is there has leaked from elsewhere.
+The weight of a component is multiplied by the mean of 1 / total over the free positions that it covers. As this changes
+the totals, it is repeated (the iteration of W. H. Richardson, "Bayesian-based iterative method of image restoration",
+J. Opt. Soc. Am. 62 (1), 1972, for a uniform image). A round changes no component by more than a factor of two: where
+the total is much smaller than 1, the station is not audible, and the density has leaked from elsewhere.
 """
 
 from dataclasses import replace
@@ -27,13 +27,13 @@ from rayfix_tables.gaussians.normal_points import normal_points
 from rayfix_tables.level import UNBALANCED, Level
 
 _CHUNK = 2**16
-"""Components that are conditioned at a time."""
+"""Number of components that are conditioned at a time."""
 
 Array = NDArray[np.float64]
 
 
 def balanced(level: Level, free_space: FreeSpace, settings: BalanceSettings | None = None) -> Level:
-    """Give a level its ``log_balance``.
+    """Compute the ``log_balance`` of a level.
 
     Parameters
     ----------
@@ -45,29 +45,29 @@ def balanced(level: Level, free_space: FreeSpace, settings: BalanceSettings | No
     settings = settings or BalanceSettings()
     if not len(level.mixture):
         return replace(level, log_balance=UNBALANCED)
-    places = _places(level, settings)
+    positions = _positions(level, settings)
     points = np.array(normal_points(settings.num_points))
     blocks = _blocks(free_space, settings.block_size)
     most = settings.max_factor
-    weight = places.weight.copy()
+    weight = positions.weight.copy()
     log_balance = np.zeros(len(weight))
     for _ in range(settings.rounds):
-        share = _shares(weight, places, points, blocks)
-        ratio = np.where(share > 0.0, 1.0 / np.clip(share, 1.0 / most, most), 1.0)
+        total = _total_probability(weight, positions, points, blocks)
+        ratio = np.where(total > 0.0, 1.0 / np.clip(total, 1.0 / most, most), 1.0)
         gain = np.empty(len(weight))
-        _gather(places.mean, places.root, points, *blocks.voxels, ratio, gain)
+        _gather(positions.mean, positions.root, points, *blocks.voxels, ratio, gain)
         weight *= gain
         log_balance += np.log(gain)
     return replace(level, log_balance=log_balance.astype(np.float32))
 
 
-class _Places(NamedTuple):
-    """Where the paths of each component lead, over all directions that may be measured.
+class _Positions(NamedTuple):
+    """Distribution of the position of each component, over all directions that may be measured.
 
     Attributes
     ----------
     weight : ndarray of shape (n,), m3
-        Integral of the component's probability over places and directions.
+        Integral of the component's probability over positions and directions.
     mean : ndarray of shape (n, 3), m
     root : ndarray of shape (n, 3, 3), m
         Lower triangular; root root' is the covariance of the position.
@@ -97,14 +97,14 @@ class _Blocks(NamedTuple):
 
     @property
     def voxels(self) -> tuple[Array, float, NDArray[np.bool_], int]:
-        """What the kernels need."""
+        """The fields that the kernels need."""
         return self.origin, self.voxel_size, self.free, self.side
 
 
-def _places(level: Level, settings: BalanceSettings) -> _Places:
-    """Condition all cells on the noise that the window is for, with the measurement in the middle of the cell.
+def _positions(level: Level, settings: BalanceSettings) -> _Positions:
+    """Condition all cells on a measurement in the middle of the cell, with the noise that the window is for.
 
-    Times the cells' solid angles, that sums over the directions that may be measured.
+    Multiplied by the cells' solid angles, this sums over all directions that may be measured.
     """
     window = level.window**2
     noise = window / settings.window_ratio**2
@@ -131,9 +131,9 @@ def _places(level: Level, settings: BalanceSettings) -> _Places:
         )
         weight[begin:end], mean[begin:end] = np.exp(log_evidence), at[:, :3]
         root[begin:end], definite = cholesky_factors(cov[:, :3, :3] + settings.thickness * np.eye(3))
-        # A component without a covariance is at no place: it adds to none, and keeps its weight.
+        # A component without a covariance has no position: it adds to no block, and its weight does not change.
         mean[begin:end][~definite] = np.nan
-    return _Places(weight, mean, root)
+    return _Positions(weight, mean, root)
 
 
 def _blocks(free_space: FreeSpace, size: float) -> _Blocks:
@@ -152,15 +152,15 @@ def _blocks(free_space: FreeSpace, size: float) -> _Blocks:
     )
 
 
-def _shares(weight: Array, places: _Places, points: Array, blocks: _Blocks) -> Array:
+def _total_probability(weight: Array, positions: _Positions, points: Array, blocks: _Blocks) -> Array:
     mass = np.zeros_like(blocks.volume)
-    _spread(weight, places.mean, places.root, points, *blocks.voxels, mass)
+    _spread(weight, positions.mean, positions.root, points, *blocks.voxels, mass)
     return np.divide(mass, blocks.volume, out=np.zeros_like(mass), where=blocks.volume > 0.0)
 
 
 @numba.njit(cache=True, nogil=True)
 def _block_of(x: Any, y: Any, z: Any, free: Any, side: Any, shape: Any) -> Any:
-    """Block of a place, counted from 0 in C order; -1 for one that is not free; coordinates are in voxels."""
+    """Index of the block of a position in C order, -1 if it is not free; coordinates are in voxels."""
     nx, ny, nz = free.shape
     i, j, k = np.floor(x), np.floor(y), np.floor(z)
     if not (0 <= i < nx and 0 <= j < ny and 0 <= k < nz and free[int(i), int(j), int(k)]):
@@ -170,7 +170,7 @@ def _block_of(x: Any, y: Any, z: Any, free: Any, side: Any, shape: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _blocks_of(mean: Any, root: Any, points: Any, origin: Any, voxel_size: Any, free: Any, side: Any, out: Any) -> None:
-    """Blocks of a component's points."""
+    """Find the blocks of a component's points."""
     shape = (0, -(-free.shape[1] // side), -(-free.shape[2] // side))
     x0, y0, z0 = mean[0] - origin[0], mean[1] - origin[1], mean[2] - origin[2]
     xx, yx, yy, zx, zy, zz = root[0, 0], root[1, 0], root[1, 1], root[2, 0], root[2, 1], root[2, 2]
@@ -184,7 +184,7 @@ def _blocks_of(mean: Any, root: Any, points: Any, origin: Any, voxel_size: Any, 
 def _spread(
     weight: Any, mean: Any, root: Any, points: Any, origin: Any, voxel_size: Any, free: Any, side: Any, mass: Any
 ) -> None:
-    """Add the components' weights to the blocks that their points are in."""
+    """Add the components' weights to the blocks that contain their points."""
     flat = mass.reshape(-1)
     blocks = np.empty(len(points), np.int64)
     for n in range(len(weight)):
@@ -207,7 +207,7 @@ def _gather(
     values: Any,
     out: Any,
 ) -> None:
-    """Means of a block's values over the free points of each component; 1 where none is free."""
+    """Means of the blocks' values over the free points of each component; 1 if none is free."""
     flat = values.reshape(-1)
     blocks = np.empty(len(points), np.int64)
     for n in range(len(mean)):

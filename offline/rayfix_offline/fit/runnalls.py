@@ -1,11 +1,11 @@
-"""Fewer components: merge those whose union loses least.
+"""Mixture reduction: merge the pair of components with the least increase in divergence, again and again.
 
 A. R. Runnalls, "Kullback-Leibler approach to Gaussian mixture reduction", IEEE Trans. Aerosp. Electron. Syst. 43 (3),
 2007: merging components i and j into the Gaussian of their moments raises the divergence from the original mixture by
 at most ``B(i, j) = ((w_i + w_j) log|P_ij| - w_i log|P_i| - w_j log|P_j|) / 2``.
 
-What takes time are the determinants |P_ij|. They are computed for one component and many others at a time, so that the
-processor works on several pairs in one instruction, and each bound is kept until one of its two components changes.
+Most of the time is spent on the determinants |P_ij|. They are computed for one component and many others at a time, so
+that one instruction of the processor treats several pairs. A bound is kept until one of its components changes.
 """
 
 from typing import Any
@@ -17,21 +17,21 @@ from rayfix_tables.gaussians.tree_reduction import SMALLEST_PIVOT
 from rayfix_tables.gaussians.triangles import pack_lower, triangle, unpack_lower
 
 LANES = 128
-"""Pairs whose determinants are computed side by side; their matrices fit the processor's first cache."""
+"""Pairs whose determinants are computed together; their matrices fit into the first-level cache."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def union_log_dets(i: Any, first: Any, stop: Any, weight: Any, mean: Any, cov: Any, scratch: Any, out: Any) -> None:
-    """Logarithms of the determinants of the covariances of component i united with others.
+    """Logarithms of the determinants of the covariances of component i merged with others.
 
     The determinant is the product of the pivots of a symmetric elimination.
 
     Parameters
     ----------
     i : int
-        United with itself, a component stays what it is.
+        Merged with itself, a component does not change.
     first, stop : int
-        The others, numbers ``first`` to ``stop - 1``.
+        The others are ``first`` to ``stop - 1``.
     weight : ndarray of shape (n,)
     mean : ndarray of shape (d, n)
     cov : ndarray of shape (d (d + 1) / 2, n)
@@ -39,27 +39,27 @@ def union_log_dets(i: Any, first: Any, stop: Any, weight: Any, mean: Any, cov: A
     scratch : ndarray
         Of :func:`new_scratch`.
     out : ndarray of shape (n,)
-        Takes the logarithms at ``first`` to ``stop - 1``.
+        Filled from ``first`` to ``stop - 1``.
     """
     size = len(mean)
-    share, spread, product, inverse, factor = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    fraction, spread, product, inverse, factor = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
     apart = scratch[5 : 5 + size]
     union = scratch[5 + size :]
     for begin in range(first, stop, LANES):
         width = min(LANES, stop - begin)
         for k in range(width):
-            share[k] = weight[i] / (weight[i] + weight[begin + k])
-            spread[k] = share[k] * (1.0 - share[k])
+            fraction[k] = weight[i] / (weight[i] + weight[begin + k])
+            spread[k] = fraction[k] * (1.0 - fraction[k])
             product[k] = 1.0
-        place = 0
+        row = 0
         for a in range(size):
             for k in range(width):
                 apart[a, k] = mean[a, i] - mean[a, begin + k]
             for b in range(a + 1):
                 for k in range(width):
-                    other = cov[place, begin + k]
-                    union[place, k] = other + share[k] * (cov[place, i] - other) + spread[k] * apart[a, k] * apart[b, k]
-                place += 1
+                    other = cov[row, begin + k]
+                    union[row, k] = other + fraction[k] * (cov[row, i] - other) + spread[k] * apart[a, k] * apart[b, k]
+                row += 1
         for j in range(size):
             diagonal = triangle(j) + j
             for k in range(width):
@@ -75,35 +75,35 @@ def union_log_dets(i: Any, first: Any, stop: Any, weight: Any, mean: Any, cov: A
                     for k in range(width):
                         union[row + b, k] -= factor[k] * union[column, k]
         for k in range(width):
-            # One logarithm of the product: the pivots of covariances in metres and radians are far from overflow.
+            # One logarithm of the product, which is far from overflow for covariances in metres and radians.
             out[begin + k] = np.log(product[k])
 
 
 @numba.njit(cache=True, nogil=True)
 def new_scratch(size: Any) -> Any:
-    """Room for :func:`union_log_dets` of components of ``size`` dimensions."""
+    """Allocate the scratch of :func:`union_log_dets` for components of ``size`` dimensions."""
     return np.empty((5 + size + triangle(size), LANES))
 
 
 @numba.njit(cache=True, nogil=True)
-def _unite(i: Any, j: Any, weight: Any, mean: Any, cov: Any) -> None:
-    """Put the union of components i and j in the place of i."""
+def _merge(i: Any, j: Any, weight: Any, mean: Any, cov: Any) -> None:
+    """Replace component i by the union of components i and j."""
     total = weight[i] + weight[j]
-    share = weight[i] / total
-    place = 0
+    fraction = weight[i] / total
+    row = 0
     for a in range(len(mean)):
         for b in range(a + 1):
-            spread = share * (1.0 - share) * (mean[a, i] - mean[a, j]) * (mean[b, i] - mean[b, j])
-            cov[place, i] = cov[place, j] + share * (cov[place, i] - cov[place, j]) + spread
-            place += 1
+            spread = fraction * (1.0 - fraction) * (mean[a, i] - mean[a, j]) * (mean[b, i] - mean[b, j])
+            cov[row, i] = cov[row, j] + fraction * (cov[row, i] - cov[row, j]) + spread
+            row += 1
     for a in range(len(mean)):
-        mean[a, i] = mean[a, j] + share * (mean[a, i] - mean[a, j])
+        mean[a, i] = mean[a, j] + fraction * (mean[a, i] - mean[a, j])
     weight[i] = total
 
 
 @numba.njit(cache=True, nogil=True)
 def _find_partner(i: Any, cost: Any, partner: Any, least: Any) -> None:
-    """Find the later component that merges with component i at the least cost."""
+    """Find the component after i that merges with it at the least cost."""
     partner[i], least[i] = -1, np.inf
     for k in range(i + 1, len(cost)):
         if cost[i, k] < least[i]:
@@ -112,7 +112,7 @@ def _find_partner(i: Any, cost: Any, partner: Any, least: Any) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def merge_runnalls(weight: Any, mean: Any, cov: Any, label: Any, max_components: Any, max_divergence: Any) -> Any:
-    """Merge components, in place, until the next merge would cost too much.
+    """Merge components, in place, until the next merge costs too much.
 
     Parameters
     ----------
@@ -121,16 +121,16 @@ def merge_runnalls(weight: Any, mean: Any, cov: Any, label: Any, max_components:
     mean : ndarray of shape (n, d)
     cov : ndarray of shape (n, d, d)
     label : ndarray of int64, shape (n,)
-        Carried along; of two merged components the heavier one's stays.
+        Of two merged components the label of the heavier one remains.
     max_components : int
-        Merging goes on at any cost until no more than these are left.
+        Merging continues at any cost until this number is reached.
     max_divergence : float
-        Below that number, merging stops at the first merge that costs more than this.
+        From then on, merging stops before the first merge that costs more than this.
 
     Returns
     -------
     ndarray of bool, shape (n,)
-        The components that are left.
+        The components that remain.
     """
     count, size = mean.shape
     middle = np.empty((size, count))
@@ -162,7 +162,7 @@ def merge_runnalls(weight: Any, mean: Any, cov: Any, label: Any, max_components:
         j = partner[i]
         if weight[j] > weight[i]:
             label[i] = label[j]
-        _unite(i, j, weight, middle, packed)
+        _merge(i, j, weight, middle, packed)
         alive[j] = False
         least[j] = np.inf
         left -= 1

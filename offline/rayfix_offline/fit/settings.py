@@ -12,7 +12,7 @@ class RayFit:
     Attributes
     ----------
     cutoff : float
-        A cell gathers rays within this many standard deviations of its window.
+        A cell uses the rays within this many standard deviations of its window.
     position_floor : float, m
         Smallest standard deviation of a component across its tube.
     length_floor : float, m
@@ -31,7 +31,7 @@ class TubeFit(RayFit):
     Attributes
     ----------
     dropped_mass : float
-        Fraction of a cell's mass that its lightest groups may take with them when they are dropped.
+        Largest fraction of a cell's mass that is dropped with its lightest groups.
     max_groups : int
         Largest number of groups of a cell that are used, the heaviest first.
     max_components : int
@@ -62,9 +62,9 @@ class ExpectationMaximisation(RayFit):
         Largest number of rounds of a fit.
     regularisation : float
         Added to the variances of the scaled points.
-    least_scale : float, m or rad
+    min_scale : float, m or rad
         Smallest standard deviation by which points are scaled.
-    least_weight : float
+    min_weight : float
         Smallest weight of a component.
     """
 
@@ -73,8 +73,8 @@ class ExpectationMaximisation(RayFit):
     seed: int = 1
     max_rounds: int = 200
     regularisation: float = 1e-6
-    least_scale: float = 1e-6
-    least_weight: float = 1e-12
+    min_scale: float = 1e-6
+    min_weight: float = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,19 +84,19 @@ class CoarseFit:
     Attributes
     ----------
     reach : float
-        Finer cells are summed within this many standard deviations.
+        Finer cells within this many standard deviations are summed.
     max_divergence : float
         Largest divergence of a merge under the noise of measurements, nats.
     noise_share : float
-        That noise is this fraction of the smallest noise of angles for which the wide window is looked up.
+        The noise of angles is this fraction of the smallest for which the wide window is used.
     range_stdev : float, m
         Standard deviation of the noise of path lengths.
     window_ratio : float
-        A window's standard deviation is at least this times that of a measurement it is looked up for.
+        A window's standard deviation is at least this times that of the measurements that it is used for.
     length_stretch : float
-        Boxes that are halved are this many times as long as wide: tubes are straight along their length.
-    least_length : float, m
-        Smallest mean path length that the size of the boxes is taken from.
+        Boxes of the tree may be this many times as long as wide, because tubes are straight along their length.
+    min_length : float, m
+        Smallest mean path length for the size of the boxes.
     position_floor : float, m
         See :class:`RayFit`.
     """
@@ -107,7 +107,7 @@ class CoarseFit:
     range_stdev: float = 0.1
     window_ratio: float = WINDOW_RATIO
     length_stretch: float = 2.5
-    least_length: float = 1e-3
+    min_length: float = 1e-3
     position_floor: float = RayFit.position_floor
 
 
@@ -120,15 +120,15 @@ class BalanceSettings:
     rounds : int
         Number of rounds.
     max_factor : float
-        Largest factor by which a round raises or lowers the value of a block.
+        Largest factor by which a round changes the value of a block.
     block_size : float, m
         Side of the blocks in which probabilities are summed, unless voxels are larger.
     num_points : int
-        Points that stand for a component.
+        Points that represent a component.
     thickness : float, m2
         Added to the variances of a component's position.
     window_ratio : float
-        A window's standard deviation is at least this times that of a measurement it is looked up for.
+        A window's standard deviation is at least this times that of the measurements that it is used for.
     """
 
     rounds: int = 3

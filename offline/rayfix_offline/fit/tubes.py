@@ -1,4 +1,4 @@
-"""``fit = "tubes"``: cells fitted by analytic moments of their ray pieces, then merged."""
+"""``fit = "tubes"``: components by analytic moments of ray pieces, reduced by merging."""
 
 from dataclasses import asdict
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ class Fitted(NamedTuple):
     counts : ndarray of int64, shape (n_cells,)
         Components of each cell.
     log_mass : ndarray of shape (n_cells,)
-        Natural logarithm of each cell's mass; -inf where no ray comes.
+        Natural logarithm of each cell's mass; -inf if no ray reaches it.
     mixture : TubeMixture
         Components of all cells.
     dropped : ndarray of int64, shape (n_cells,)
@@ -86,8 +86,8 @@ def fitted_cells(
 ) -> Fitted:
     """Turn the joint moments of the components of cells into mixtures.
 
-    Components without a positive definite covariance are dropped with their weight, which the cell's mass loses; the
-    weights that are left add up to 1 again. Rounding can make such components of masses next to the smallest number.
+    Components without a positive definite covariance are dropped with their weight: the cell's mass is reduced, and the
+    remaining weights add up to 1. Rounding can produce such components where masses are close to the smallest number.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def joint_to_tubes(
     *,
     position_floor: float,
 ) -> TubeMixture:
-    """Turn joint moments of (u, x) into the table's form, u and x given u.
+    """Convert joint moments of (u, x) into those of u and of x given u, as the table has them.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def joint_to_tubes(
     u_cov = cov[:, :3, :3]
     jacobian = np.swapaxes(np.linalg.solve(u_cov, cov[:, :3, 3:]), 1, 2) if len(mean) else np.zeros((0, 3, 3))
     x_cov = cov[:, 3:, 3:] - jacobian @ cov[:, :3, 3:] - widening_cov(mean[:, :3], u_cov, jacobian)
-    # Of components that are not quite one tube, the widening that one would have may be more than there is.
+    # A component that is not a single tube may be narrower than the widening of one.
     spread, axes = np.linalg.eigh(x_cov)
     spread = np.maximum(spread, position_floor**2)
     x_cov = (axes * spread[:, None, :]) @ axes.transpose(0, 2, 1)
@@ -186,9 +186,9 @@ def _fit_block(
             continue
         order = np.argsort(-mass)
         kept = 0
-        gone = whole
-        while kept < min(len(mass), fit.max_groups) and gone > fit.dropped_mass * whole:
-            gone -= mass[order[kept]]
+        left = whole
+        while kept < min(len(mass), fit.max_groups) and left > fit.dropped_mass * whole:
+            left -= mass[order[kept]]
             kept += 1
         chosen = order[:kept]
         weight = mass[chosen] / mass[chosen].sum()

@@ -1,12 +1,11 @@
-"""Cells of wide windows, each the sum of cells of the next finer level.
+"""Cells of wide windows, each a weighted sum of cells of the next finer level.
 
 The windows of the finer cells f around a cell c add up to its own, N(a; 0, W) = sum_f q_f N(a - f; 0, W_f) with
-``q_f = N(f; 0, W - W_f) dOmega_f``: their grid is so close that the sum is flat to 1e-5. Rays need not be gathered
-again, and a wide cell keeps what fine cells know of the edges that cut its rays off, where Gaussians gathered over the
-wide window would blur them.
+``q_f = N(f; 0, W - W_f) dOmega_f``; their grid is so fine that the sum is exact to 1e-5. Rays are not gathered again,
+and edges that cut rays off remain as sharp as in the fine cells. Gaussians fitted over the wide window would blur them.
 
-Such a sum has thousands of components, most of which no report that needs the wide window could tell apart: it is
-looked up for angles with more noise than the finer level serves. They are merged under that noise.
+Such a sum has thousands of components. A wide window is used for angles with more noise than the finer level is for,
+and most of the components cannot be distinguished under that noise. They are merged under it.
 """
 
 from dataclasses import dataclass
@@ -74,9 +73,9 @@ class SummedCells:
     counts : ndarray of int64, shape (n_cells,)
         Components of each cell.
     log_mass : ndarray of shape (n_cells,)
-        Natural logarithm of each cell's mass; -inf where no ray comes.
+        Natural logarithm of each cell's mass; -inf if no ray reaches it.
     change : ndarray of shape (n_cells,)
-        Bound on the change of each cell's measure, as a share of its mass.
+        Bound on the change of each cell's measure, as a fraction of its mass.
     mixture : TubeMixture
         Components of all cells.
     dropped : ndarray of int64, shape (n_cells,)
@@ -100,14 +99,14 @@ def sum_cells(
     centres : ndarray of shape (n_cells, 2), rad
         Azimuths and zeniths of at least one cell.
     window : float, rad
-        At least ``LEAST_WINDOW_RATIO`` of the site file times the finer level's.
+        At least ``MIN_WINDOW_RATIO`` of the site file times the finer level's.
     finer_change : ndarray of shape (n_finer_cells,)
-        Bound on the change of each finer cell's measure, as a share of its mass.
+        Bound on the change of each finer cell's measure, as a fraction of its mass.
     """
-    # Less noise than this is served by the finer level itself.
+    # For less noise than this, the finer level is used.
     angle = fit.noise_share * finer.window / fit.window_ratio
     noise = np.array([fit.range_stdev**2, angle**2, angle**2, 0.0, 0.0, 0.0])
-    # A change is a share of the mass as it would be, and what is summed are masses as they are.
+    # A change is a fraction of the mass that an exact build gives; summed are the present masses.
     of_present = finer_change / np.maximum(1.0 - finer_change, 0.5)
     log_mass, change = np.empty(len(centres)), np.empty(len(centres))
     cells = _FinerCells.of(finer, of_present)
@@ -122,7 +121,7 @@ def sum_cells(
             fit.reach,
             fit.max_divergence,
             fit.length_stretch,
-            fit.least_length,
+            fit.min_length,
         )
         parts.append(components)
     weight, mean, cov, num_reflections = (np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -134,13 +133,13 @@ def sum_cells(
 
 
 @numba.njit(cache=True, nogil=True)
-def _scale(weight: Any, mean: Any, noise: Any, length_stretch: Any, least_length: Any) -> Any:
-    """Lengths in the units of which boxes are halved: what the noise of an angle makes at the mean path length."""
+def _scale(weight: Any, mean: Any, noise: Any, length_stretch: Any, min_length: Any) -> Any:
+    """Units in which the sides of boxes are compared: the effect of the angle noise at the mean path length."""
     length = 0.0
     for i in range(len(weight)):
         length += weight[i] * mean[i, 0]
     angle = np.sqrt(noise[1])
-    scale = np.full(SIZE, max(length, least_length) * angle)
+    scale = np.full(SIZE, max(length, min_length) * angle)
     scale[0] *= length_stretch  # tubes are straight along their length
     scale[1] = angle
     scale[2] = angle
@@ -183,7 +182,7 @@ def _sum_cell(
     reach: Any,
     max_divergence: Any,
     length_stretch: Any,
-    least_length: Any,
+    min_length: Any,
 ) -> Any:
     """Sum the cells around a direction: log mass, change, weights, means, covariances and numbers of reflections."""
     fine_window, ring_offsets, ring_cells = finer.window, finer.ring_offsets, finer.ring_cells
@@ -225,28 +224,28 @@ def _sum_cell(
     if total == 0:
         return -np.inf, 0.0, weight, mean, cov, label
     top = max(logs)
-    place = 0
+    row = 0
     mass = 0.0
     change = 0.0
     for n in range(len(cells)):
         across, down, stretch = moved[n]
-        share = np.exp(logs[n] - top)
-        mass += share
-        change += share * finer.cell_change[cells[n]]
+        factor = np.exp(logs[n] - top)
+        mass += factor
+        change += factor * finer.cell_change[cells[n]]
         for k in range(offsets[cells[n]], offsets[cells[n] + 1]):
-            weight[place] = share * np.exp(np.float64(finer.log_weight[k]))
-            label[place] = finer.num_reflections[k]
-            _joint(k, finer, mean[place], cov[place])
-            mean[place, 1] = across + stretch * mean[place, 1]
-            mean[place, 2] += down
+            weight[row] = factor * np.exp(np.float64(finer.log_weight[k]))
+            label[row] = finer.num_reflections[k]
+            _joint(k, finer, mean[row], cov[row])
+            mean[row, 1] = across + stretch * mean[row, 1]
+            mean[row, 2] += down
             for i in range(SIZE):
-                cov[place, 1, i] *= stretch
-                cov[place, i, 1] *= stretch
-            place += 1
+                cov[row, 1, i] *= stretch
+                cov[row, i, 1] *= stretch
+            row += 1
     weight /= weight.sum()
-    # Of components that become one, the number of reflections of the heaviest stays.
+    # A merged component has the number of reflections of its heaviest part.
     heaviest = weight.copy()
-    scale, one_group = _scale(weight, mean, noise, length_stretch, least_length), np.zeros(total, np.int64)
+    scale, one_group = _scale(weight, mean, noise, length_stretch, min_length), np.zeros(total, np.int64)
     into = halve_and_merge(weight, mean, cov, one_group, scale, noise, max_divergence)
     for n in range(total):
         if heaviest[n] > heaviest[into[n]]:

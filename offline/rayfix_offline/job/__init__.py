@@ -1,1 +1,1 @@
-"""The build as a job: what is to be done, what an earlier build left, and who does it."""
+"""The build as a job: its plan, results of earlier builds, and the engines that do the work."""

@@ -1,10 +1,10 @@
-"""By how much the measures that cells are fitted to differ between two traces of a station.
+"""Changes of cells between two traces of a station: how far the measures that they are fitted to differ.
 
-Rays of both traces start in the same directions, so they are compared one by one, piece by piece. A piece counts with
-the part of its mass that the other trace has not: all of it where the ray runs another course, ``|m - m'|`` where it
-runs the same course through other weights. A cell's change is the sum over its rays, weighted by its window, as a share
-of its mass: a bound on the L1 distance of the two measures. Cells whose pieces are the same to the last bit change by
-exactly 0, and their fit is the same to the last bit.
+Rays of both traces have the same launch directions, so that they are compared one by one, piece by piece. A piece
+contributes the part of its mass that is missing in the other trace: all of it where the rays differ, ``|m - m'|`` where
+they are the same with other weights. The change of a cell is the sum over its rays, weighted by its window, as a
+fraction of its mass: a bound on the L1 distance of the two measures. Cells whose pieces are equal to the last bit have
+a change of exactly 0, and their fits are equal to the last bit.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from rayfix_offline.fit.settings import RayFit
 from rayfix_offline.rays.trace import LevelRays
 
 SMALLEST = float(np.finfo(np.float32).tiny)
-"""Change of a cell that is not the same to the last bit, at least: 0 stands for an exact one."""
+"""Smallest change of a cell that is not equal to the last bit: 0 means exact."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class ComparisonSettings:
     Attributes
     ----------
     same_course : float, m and 1
-        Reflection sequences whose mirror images and mirrors differ by no more than this are the same.
+        Largest difference between the mirror images and mirrors of equal reflection sequences.
     """
 
     same_course: float = 1e-6
@@ -85,8 +85,8 @@ def cell_changes(
     Returns
     -------
     ndarray of shape (n_cells,)
-        Change of each cell's measure as a share of its new mass; 0 where nothing at all has changed, inf where no ray
-        comes any longer, and everywhere if the rays do not start in the same directions.
+        Change of each cell's measure as a fraction of its new mass: 0 if nothing has changed, inf if no ray reaches the
+        cell any longer, and inf for all cells if the launch directions differ.
     """
     if not np.array_equal(old.rays.directions, new.rays.directions):
         return np.full(new.grid.num_cells, np.inf)
@@ -117,11 +117,11 @@ def ray_changes(
     Returns
     -------
     change : ndarray of shape (n_rays,), m3 / sr
-        Mass that only one of the traces has.
+        Mass that occurs in one of the traces only.
     mass : ndarray of shape (n_rays,), m3 / sr
         Mass in the new trace.
     same : ndarray of bool, shape (n_rays,)
-        Whether all pieces are the same to the last bit.
+        Whether all pieces are equal to the last bit.
     """
     same_course = (settings or ComparisonSettings()).same_course
     change, mass, same = _compare(_Trace.of(old), _Trace.of(new), same_course)
@@ -135,25 +135,25 @@ def _compare(a: Any, b: Any, same_course: Any) -> Any:
     change = np.zeros(num_rays)
     mass = np.zeros(num_rays)
     same = np.ones(num_rays, np.bool_)
-    # Sequences that the fit gathers in one scene and not in the other: facets of a surface that has become another.
+    # Sequences that the fit joins in one scene only, because a curved surface has changed.
     partner_a, partner_b = np.full(len(a.images), -1), np.full(len(b.images), -1)
     torn = np.zeros(len(b.images), np.bool_)
     for ray in range(num_rays):
         i, stop_i = a.offsets[ray], a.offsets[ray + 1]
         j, stop_j = b.offsets[ray], b.offsets[ray + 1]
         while i < stop_i or j < stop_j:
-            # The next straight stretch of the ray in either trace.
+            # The next straight segment of the ray in each trace.
             end_i, end_j = i, j
             while end_i < stop_i and a.sequence[end_i] == a.sequence[i]:
                 end_i += 1
             while end_j < stop_j and b.sequence[end_j] == b.sequence[j]:
                 end_j += 1
-            apart = np.inf
+            distance = np.inf
             if i < end_i and j < end_j:
-                apart = _distance(
+                distance = _distance(
                     a.images[a.sequence[i]], a.mirrors[a.sequence[i]], b.images[b.sequence[j]], b.mirrors[b.sequence[j]]
                 )
-            if apart != 0.0:
+            if distance != 0.0:
                 same[ray] = False
             else:
                 whole_a, whole_b = a.surfaces[a.sequence[i]], b.surfaces[b.sequence[j]]
@@ -164,14 +164,14 @@ def _compare(a: Any, b: Any, same_course: Any) -> Any:
                     if partner_a[whole_a] >= 0:
                         torn[partner_a[whole_a]] = True
             while i < end_i or j < end_j:
-                if apart <= same_course and i < end_i and j < end_j and a.slice[i] == b.slice[j]:
+                if distance <= same_course and i < end_i and j < end_j and a.slice[i] == b.slice[j]:
                     change[ray] += abs(a.mass[i] - b.mass[j])
                     mass[ray] += b.mass[j]
                     moved = abs(a.mean[i] - b.mean[j])
                     if moved > 0.0:
                         # The L1 distance of two normal densities is below their distance in standard deviations.
-                        deviation = np.sqrt(max(a.variance[i], b.variance[j]))
-                        change[ray] += min(a.mass[i], b.mass[j]) * (min(2.0, moved / deviation) if deviation else 2.0)
+                        stdev = np.sqrt(max(a.variance[i], b.variance[j]))
+                        change[ray] += min(a.mass[i], b.mass[j]) * (min(2.0, moved / stdev) if stdev else 2.0)
                     if a.mass[i] != b.mass[j] or moved > 0.0 or a.variance[i] != b.variance[j]:
                         same[ray] = False
                     i += 1
@@ -218,7 +218,7 @@ def _sum_over_cells(
     mass: Any,
     same: Any,
 ) -> Any:
-    """Sum over the rays that a cell gathers; see :func:`rayfix_offline.fit.moments.gather_groups`."""
+    """Sum the changes of the rays of each cell; see :func:`rayfix_offline.fit.moments.gather_groups`."""
     result = np.zeros(len(centres))
     reach = cutoff * window
     num_rings = len(ring_cells)

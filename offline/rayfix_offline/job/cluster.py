@@ -1,8 +1,8 @@
-"""Fit blocks of cells on a Dask cluster.
+"""The engine that uses a Dask cluster.
 
-Tasks carry the numbers of their cells only. A worker gets the scene and the site once, by content hash, and traces a
-station's rays when the first of its blocks arrives; a block fitted on any worker with the same kind of processor and
-the same libraries is the same to the last bit. When a worker is lost, Dask gives its blocks to the others.
+A task contains only the indices of its cells. A worker receives site, scene and method once, by content hash, and
+traces a station's rays for the first of its blocks. The result of a block is the same to the last bit on any worker
+with the same kind of processor and the same libraries. If a worker is lost, Dask assigns its blocks to others.
 """
 
 import threading
@@ -30,13 +30,13 @@ from rayfix_tables.errors import BuildError
 from rayfix_tables.level import Level
 
 CONNECT_SECONDS = 15
-"""How long a scheduler may take to answer."""
+"""Time-out of the connection to a scheduler, s."""
 
 RETRIES = 5
-"""How often a block may be lost with its worker."""
+"""Number of times that a block may be lost with its worker."""
 
 TRACES_KEPT = 2
-"""Stations whose rays a worker keeps in memory; blocks come station by station."""
+"""Number of stations whose rays a worker keeps in memory; blocks arrive station by station."""
 
 _Inputs = tuple[dict[str, Any], Scene, Method]
 _Task = tuple[Callable[..., dict[str, Any]], tuple[Any, ...]]
@@ -78,15 +78,15 @@ class Cluster:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the connection; tasks that are under way are given up."""
+        """Close the connection; running tasks are abandoned."""
         self._client.close()
 
     def keep(self, plan: StationPlan, former: FormerStation) -> KeptCells:
-        """Compare in this process, for which both scenes are traced here."""
+        """Compare in this process, which traces both scenes."""
         return self._local.keep(plan, former)
 
     def launch(self, plan: StationPlan) -> dict[str, Any]:
-        """Trace a station's rays on a worker, unless they were traced here to compare them.
+        """Trace a station's rays on a worker, unless this process has traced them for a comparison.
 
         Raises
         ------
@@ -125,7 +125,7 @@ class Cluster:
             return
         by_name = {block.shard: block for block in blocks}
         with warnings.catch_warnings():
-            # The finer level goes to the scheduler once and from there to each worker, which is what is wanted.
+            # The finer level goes to the scheduler once and from there to each worker, of which Dask warns.
             warnings.simplefilter("ignore", UserWarning)
             source = self._client.submit(
                 _hand_on, finer, finer_change, key=f"rayfix-{plan.part_id}-under-{blocks[0].level}"
@@ -136,7 +136,7 @@ class Cluster:
 
     def _run(self, plan: StationPlan, tasks: Mapping[str, _Task]) -> Iterator[tuple[str, dict[str, Any]]]:
         """Run tasks on the workers."""
-        # A task that hands the inputs on, and not data scattered to workers: Dask can repeat it when they are lost.
+        # A task returns the inputs, instead of scattered data, because Dask can repeat a task after a loss.
         inputs = self._client.submit(_hand_on, *self._inputs, key=f"rayfix-inputs-{self._inputs_id}")
         futures = {
             self._client.submit(
@@ -154,7 +154,7 @@ class Cluster:
                 arrays = future.result()
             except BuildError:
                 raise
-            except Exception as error:  # whatever a worker of the cluster meets
+            except Exception as error:  # any error of a worker
                 raise BuildError(
                     f"station '{plan.station.id}' could not be built on the cluster: {error}; finished blocks are "
                     "kept, run the same build again to go on"
@@ -164,12 +164,12 @@ class Cluster:
 
 
 def _fingerprint(arguments: tuple[Any, ...]) -> str:
-    """Tell tasks of one block apart that fit different cells of it."""
+    """Distinguish tasks that fit different cells of one block."""
     return content_key([a.tolist() for a in arguments if isinstance(a, np.ndarray)])[:16]
 
 
 def _hand_on(*inputs: Any) -> tuple[Any, ...]:
-    """Hand inputs of many tasks on to the workers."""
+    """Return the inputs of many tasks, so that workers share them."""
     return inputs
 
 
@@ -186,7 +186,7 @@ def _widen_remotely(
     level: int,
     cells: NDArray[np.int64],
 ) -> dict[str, Any]:
-    """Make a block of a wide level on a worker."""
+    """Widen a block on a worker."""
     _check_version(part[1])
     method = inputs[2]
     window = float(np.deg2rad(parse_site(inputs[0]).table.windows_deg[level]))

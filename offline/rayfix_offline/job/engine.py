@@ -1,4 +1,4 @@
-"""What the stations of a build have in common, and the protocol of those who trace and fit them."""
+"""The common data of a build's stations, and the protocol of the engines that trace and fit them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,24 +19,24 @@ from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 
 FittedBlocks = Iterator[tuple[Block, FittedCells]]
-"""Blocks and their cells, as they are ready."""
+"""Fitted blocks, in the order in which they are finished."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What the stations of a build have in common.
+    """The common data of a build's stations.
 
     Attributes
     ----------
     method : Method
-        By which the twin was prepared, and cells are fitted.
+        Method by which the twin was prepared and cells are fitted.
     jobs : int
-        Cells that are fitted at a time; -1 for one per core.
+        Number of cells that are fitted at a time; -1 for one per core.
     former : FormerTable, optional
         Table whose cells are kept where their rays have not changed.
     tolerance : float
-        Fraction of a cell's mass that may change before the cell is fitted again; with 0, a cell is kept only when it
-        is the same to the last bit.
+        Fraction of a cell's mass that may change before the cell is fitted again; with 0, a cell is kept only if it is
+        equal to the last bit.
     """
 
     site: SiteFile
@@ -65,7 +65,7 @@ class FittingEngine(Protocol):
     """Traces the rays of one station after the other, and fits its cells."""
 
     def keep(self, plan: StationPlan, former: FormerStation) -> KeptCells:
-        """Trace a station's rays, and find the cells of a former table that need not be fitted again."""
+        """Trace a station's rays and find the cells of a former table that can be kept."""
         ...
 
     def launch(self, plan: StationPlan) -> dict[str, Any]:

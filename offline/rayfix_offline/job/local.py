@@ -1,4 +1,4 @@
-"""Fit blocks of cells on the cores of this machine."""
+"""The engine that uses the cores of this machine."""
 
 import warnings
 from collections.abc import Iterable
@@ -71,6 +71,6 @@ def _in_parallel(blocks: list[Block], tasks: Iterable[Any], jobs: int, prefer: s
         yield from zip(blocks, results, strict=True)
     finally:
         with warnings.catch_warnings():
-            # An interrupted build gives tasks up on purpose; joblib need not warn of it.
+            # An interrupted build abandons tasks on purpose, of which joblib warns.
             warnings.simplefilter("ignore", UserWarning)
             results.close()

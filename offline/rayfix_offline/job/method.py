@@ -1,7 +1,7 @@
-"""The method: every number of the software that decides what a table of a site is.
+"""The method: all numbers of the software that decide the content of a table.
 
-A part of a table is named by all that decides its content (:func:`rayfix_offline.job.plan.plan_build`). So a number
-that decides content is a field here, and a part that was made with another value is made again.
+They belong to the identity of each part of a table (:func:`rayfix_offline.job.plan.plan_build`): a part that was built
+with another number is built again.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from rayfix_tables.gaussians.tree_reduction import SMALLEST_PIVOT
 
 @dataclass(frozen=True, kw_only=True)
 class FixedNumbers:
-    """Numbers that compiled kernels close over, and tables of standards: part of the identity, but not to be chosen."""
+    """Constants of compiled kernels and of standards: part of the identity, but not adjustable."""
 
     gauss: tuple[tuple[float, float], ...] = field(default=GAUSS, init=False)
     ray_ranges: int = field(default=RAY_RANGES, init=False)
@@ -47,7 +47,7 @@ class Method:
     fixed: FixedNumbers = field(default_factory=FixedNumbers)
 
     def fit(self, site: SiteFile) -> TubeFit | ExpectationMaximisation:
-        """Return the fit that a site asks for."""
+        """Return the settings of the fit that a site selects."""
         return replace(self.em, seed=site.table.seed) if site.table.fit == "em" else self.tubes
 
     def identity(self) -> dict[str, Any]:

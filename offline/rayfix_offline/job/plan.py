@@ -1,4 +1,4 @@
-"""What a build has to do: the cells of each station in blocks, each part named by all that decides its content."""
+"""The plan of a build: each station's cells in blocks, and an identity of all that decides their content."""
 
 import hashlib
 from dataclasses import dataclass, replace
@@ -16,13 +16,13 @@ from rayfix_tables.disk.schema import FORMAT_VERSION
 from rayfix_tables.site import Station
 
 BUILD_VERSION = 5
-"""Raised with every change of the software that makes another table of the same site; numbers are in the method."""
+"""Raised with every change of the code that changes a table; numbers that do are part of the method."""
 
 BLOCK_CELLS = 256
-"""Cells that one task fits and one shard holds."""
+"""Number of cells of one task and one shard."""
 
 WIDE_BLOCK_CELLS = 64
-"""The same for the levels whose cells are sums of others."""
+"""The same for levels whose cells are sums of finer ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,23 +48,23 @@ class Block:
 
     @property
     def shard(self) -> str:
-        """Last part of the name of the block's shard."""
+        """Suffix of the name of the block's shard."""
         return f"{self.level}-{self.number}"
 
     def only(self, cells: NDArray[np.int64]) -> "Block":
-        """Return the block with some of its cells only."""
+        """Return the block with a subset of its cells."""
         return replace(self, cells=cells)
 
 
 @dataclass(frozen=True, kw_only=True)
 class StationPlan:
-    """The part of a build that concerns one station.
+    """The plan of one station's part of the table.
 
     Attributes
     ----------
     part_id : str
-        SHA-256 over all that decides the station's part of the table: scene, free space, propagation, table settings,
-        the station itself but for its bias, and the version of the software's method. Other stations do not count.
+        SHA-256 of all that decides the content of the part: scene, free space, propagation, table settings, the station
+        without its bias, and the method with its version. Other stations have no influence.
     """
 
     section: StationSection
@@ -79,7 +79,7 @@ class StationPlan:
 
     @property
     def num_finest_cells(self) -> int:
-        """Number of cells that are fitted to rays."""
+        """Number of cells to fit to rays."""
         return sum(len(block.cells) for block in self.finest_blocks)
 
     @property
@@ -94,7 +94,7 @@ def plan_build(site: SiteFile, twin: Twin, method: Method | None = None) -> tupl
     Parameters
     ----------
     twin : Twin
-        Prepared by the same method.
+        Prepared with the same method.
     method : Method, optional
     """
     method = method or Method()
@@ -120,12 +120,12 @@ def plan_build(site: SiteFile, twin: Twin, method: Method | None = None) -> tupl
 
 
 def updated_part_id(exact_part_id: str, former_part_id: str, tolerance: float) -> str:
-    """``part_id`` of a part some of whose cells were kept from a former part though they had changed a little."""
+    """``part_id`` of a part with cells of a former part that have changed within the tolerance."""
     return content_key("updated", exact_part_id, former_part_id, tolerance)
 
 
 def _blocks(station: Station, site: SiteFile, method: Method) -> tuple[Block, ...]:
-    """Cells of each level whose centre lies in the station's field of view or hardly outside, in blocks."""
+    """Cells of each level whose centre lies within one window of the station's field of view, in blocks."""
     axis = local_to_scene(station.orientation)[:, 0]
     blocks: list[Block] = []
     for level, window in enumerate(np.deg2rad(site.table.windows_deg)):

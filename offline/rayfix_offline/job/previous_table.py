@@ -1,8 +1,8 @@
-"""What a former table still holds of the table to be: whole parts of stations, and cells whose rays have not changed.
+"""Reuse of a former table: whole parts of stations, and cells whose rays have not changed.
 
-A table carries its scene, its site and what decided each part, so a former station can be traced again in its former
-scene and compared, cell by cell, with the trace in the new one. Only parts that this version of the software would make
-from what the table carries are taken.
+A table contains its scene, its site and the identity of each part. A former station can therefore be traced again in
+its former scene and be compared, cell by cell, with the trace in the new scene. Only parts that this version of the
+software would build from the table's scene and site are used.
 """
 
 from collections.abc import Callable
@@ -28,21 +28,21 @@ from rayfix_tables.table import StationPart, Table
 
 @dataclass(frozen=True, kw_only=True)
 class KeptCells:
-    """Cells of a station's finest level that need not be fitted again.
+    """Cells of a station's finest level that are kept.
 
     Attributes
     ----------
     part : StationPart
-        That they come from.
+        Source of the cells.
     change : ndarray of shape (n_cells,)
-        Bound on the change of each cell's measure since it was fitted; inf where it must be fitted again.
+        Bound on the change of each cell's measure since it was fitted; inf if it must be fitted again.
     """
 
     part: StationPart
     change: NDArray[np.float64]
 
     def split(self, block: Block) -> tuple[FittedCells, Block]:
-        """Divide a block into the cells that are kept and those that must be fitted."""
+        """Split a block into kept cells and cells to fit."""
         change = self.change[block.cells]
         kept = np.isfinite(change)
         cells = FittedCells.of_level(self.part.levels[0], block.cells[kept], change[kept])
@@ -51,16 +51,16 @@ class KeptCells:
 
 @dataclass(frozen=True, kw_only=True)
 class FormerStation:
-    """A station of a former table that stands where one of the new table stands.
+    """A station of a former table at the position of a station of the new one.
 
     Attributes
     ----------
     plan : StationPlan
-        By which the part was built.
+        Plan of the former part.
     site, twin : SiteFile, Twin
-        For which the part was built.
+        Site and twin of the former part.
     method : Method
-        By which it was built, and the new one will be.
+        Method of both builds.
     """
 
     part: StationPart
@@ -70,14 +70,14 @@ class FormerStation:
     method: Method
 
     def kept_cells(self, trace: StationTrace, tolerance: float, *, jobs: int = 1) -> KeptCells:
-        """Find the cells that have changed no more than a tolerance.
+        """Find the cells whose change is within a tolerance.
 
         Parameters
         ----------
         trace : StationTrace
-            In the new scene.
+            Trace in the new scene.
         tolerance : float
-            Largest change; with 0, only cells that are the same to the last bit.
+            Largest change; with 0, only cells that are equal to the last bit.
         jobs : int
             Threads; -1 for one per core.
         """
@@ -91,20 +91,20 @@ class FormerStation:
         for block in self.plan.finest_blocks:
             change[block.cells] = compared[block.cells]
         if self.part.update is not None:
-            # The cell was kept before: the changes add up, each as a share of the mass after it.
+            # The cell was kept before: changes add up, each as a fraction of the mass after it.
             change += self.part.update.cell_change[0] * (1.0 + change)
         return KeptCells(part=self.part, change=np.where(change <= tolerance, change, np.inf))
 
 
 @dataclass(frozen=True, kw_only=True)
 class FormerTable:
-    """A table that was built before, and the method that the new one is built by."""
+    """A table of an earlier build, and the method of the new one."""
 
     table: Table
     method: Method
 
     def whole_part(self, plan: StationPlan, tolerance: float) -> StationPart | None:
-        """Return the part that a plan asks for, or one that was updated to it within the tolerance."""
+        """Return the part of a plan, or one that was updated to it within the tolerance."""
         for part in self.table.parts.values():
             update = part.update
             near = update is not None and update.exact_part_id == plan.part_id and update.largest_change <= tolerance
@@ -113,7 +113,7 @@ class FormerTable:
         return None
 
     def station(self, plan: StationPlan, site: SiteFile) -> FormerStation | None:
-        """Return the station that stood where a plan's does, if its rays start in the same directions."""
+        """Return the former station at the position of a plan's, if its rays have the same launch directions."""
         part = self.table.parts.get(plan.station.id)
         if part is None or part.station.position != plan.station.position or not self._sound or not self._inputs:
             return None
@@ -138,7 +138,7 @@ class FormerTable:
 
     @cached_property
     def _inputs(self) -> tuple[SiteFile, Twin, dict[str, StationPlan]] | None:
-        """Site, scene and plans that the table was built from, none if this software reads them in another way."""
+        """Site, twin and plans of the table; None if this version of the software cannot read its site."""
         stored = self.table.scene
         scene = Scene(
             vertices=np.array(stored.vertices),
@@ -164,7 +164,7 @@ def read_former(
     Parameters
     ----------
     required : bool
-        Whether a file that is missing or no table is an error, or just no former table.
+        Whether a file that is missing or is no table is an error; otherwise there is no former table.
     refused : callable, optional
         Told why a file that is there is not taken.
 

@@ -1,4 +1,4 @@
-"""Build one station's part of a table, from shards, from a former table, and by fitting what is left."""
+"""Build one station's part of a table from shards, from a former table, and by fitting the remaining cells."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,21 +18,21 @@ from rayfix_tables.update import Update
 from rayfix_tables.write import StationContent
 
 StationProgress = Callable[[str, int], None]
-"""Called with the stage and the cells of the station that are done."""
+"""Called with the stage and the number of the station's cells that are done."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BuiltStation:
-    """A station's part, and where it came from.
+    """A station's part and its origin.
 
     Attributes
     ----------
     origin : {"built", "resumed", "updated", "kept"}
-        Fitted now; some blocks from shards; some cells from a former table; all of it from there.
+        Fitted now; some blocks from shards; some cells from a former table; the whole part from there.
     num_kept_cells : int
-        Cells of the finest level taken from the former table.
+        Number of cells of the finest level taken from the former table.
     num_dropped : int
-        Components that were dropped, because they had no positive definite covariance; 0 for a part that was kept.
+        Number of components dropped for want of a positive definite covariance; 0 for a part that was kept.
     """
 
     content: StationContent
@@ -42,7 +42,7 @@ class BuiltStation:
 
 
 def keep_station(plan: StationPlan, job: Job) -> BuiltStation | None:
-    """Take a station's whole part from the former table, if it is still right."""
+    """Take a station's whole part from the former table, if it is still valid."""
     part = job.former.whole_part(plan, job.tolerance) if job.former else None
     if part is None:
         return None
@@ -105,18 +105,18 @@ def _stage(plan: StationPlan, job: Job, block: Block) -> str:
 def _load(
     name: str, plan: StationPlan, store: ShardStore
 ) -> tuple[dict[str, Any] | None, dict[tuple[int, int], FittedCells]]:
-    """Load what the launch found out and the finished blocks."""
+    """Load the statistics of the launch and the finished blocks."""
     parts = {}
     for block in plan.blocks:
         arrays = store.load(f"{name}-{block.shard}")
-        # Blocks of another size are other cells under the same name.
+        # With another block size, a shard of the same name has other cells.
         if arrays is not None and np.array_equal(arrays["cells"], block.cells):
             parts[block.key] = FittedCells.from_arrays(arrays)
     return store.load(f"{name}-launch"), parts
 
 
 def _split(blocks: list[Block], kept: KeptCells) -> tuple[dict[tuple[int, int], FittedCells], list[Block]]:
-    """Divide blocks into the cells that are kept, by block, and blocks of the others."""
+    """Split blocks into kept cells, by block, and blocks of cells to fit."""
     parts, missing = {}, []
     for block in blocks:
         cells, rest = kept.split(block)
@@ -130,7 +130,7 @@ def _split(blocks: list[Block], kept: KeptCells) -> tuple[dict[tuple[int, int], 
 def _assemble_level(
     level: int, job: Job, parts: dict[tuple[int, int], FittedCells]
 ) -> tuple[Level, NDArray[np.float32]]:
-    """Put the blocks of a level together, and the changes of its cells."""
+    """Assemble the blocks of a level, and the changes of its cells."""
     grid = job.grid(level)
     blocks = [parts[key] for key in sorted(parts) if key[0] == level]
     return assemble_level(job.window(level), grid, blocks), assemble_changes(grid, blocks)
@@ -143,7 +143,7 @@ def _assemble(
     levels: list[tuple[Level, NDArray[np.float32]]],
     launch: dict[str, Any],
 ) -> StationContent:
-    """Put the levels of a station together."""
+    """Assemble the levels of a station."""
     part_id, update = plan.part_id, None
     change = tuple(change for _, change in levels)
     if former is not None and any(level.any() for level in change):
@@ -159,7 +159,7 @@ def _assemble(
         update=update,
         levels=tuple(level for level, _ in levels),
         lost_ray_share=float(launch["lost_ray_share"]),
-        coverage=tuple(float(share) for share in launch["coverage"]),
+        coverage=tuple(float(fraction) for fraction in launch["coverage"]),
     )
 
 

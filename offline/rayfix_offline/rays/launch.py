@@ -1,8 +1,8 @@
-"""Launch rays from a station and follow them from mirror to mirror.
+"""Launch rays from a station and trace their reflections.
 
-Of every ray only lengths are kept: along one reflection sequence a ray runs on ``image + length * mirror @ direction``,
-where ``image`` is the station mirrored at the sequence's planes and ``mirror`` the product of their reflections. So a
-hit comes from one division, however many reflections went before, and nothing accumulates.
+Only path lengths are stored: after a reflection sequence a ray is the line ``image + length * mirror @ direction``,
+where ``image`` is the station mirrored at the planes of the sequence and ``mirror`` the product of their reflections. A
+hit point therefore takes one division, whatever the number of reflections, and rounding errors do not accumulate.
 """
 
 from typing import Any, NamedTuple
@@ -30,7 +30,7 @@ def launch(
     max_path_length: float,
     mirror_offset: float = RaySettings.mirror_offset,
 ) -> Segments:
-    """Launch rays and mirror them at what they hit.
+    """Launch rays and reflect them at the planes that they hit.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def launch(
     reflectivity : Reflectivity
         Of the engine's triangles.
     bounds : ndarray of shape (2, 3), m
-        Low and high corner of the scene; a ray that hits nothing ends there.
+        Low and high corner of the scene; a ray that hits no triangle ends there.
     max_path_length : float, m
         Rays end at this unfolded length.
     mirror_offset : float
@@ -119,7 +119,7 @@ class _Mirrors(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """What becomes :class:`Segments`."""
+    """Columns of :class:`Segments`, filled depth by depth."""
 
     sequence: NDArray[np.int32]
     start: NDArray[np.float64]
@@ -127,7 +127,7 @@ class _Columns(NamedTuple):
 
 
 class _Front(NamedTuple):
-    """Rays that are still on their way.
+    """Rays that have not ended.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class _Front(NamedTuple):
     cosines : ndarray of shape (n,)
         Cosine of the angle of incidence.
     origins, headings : ndarray of float32, shape (n, 3)
-        Where and in which direction each ray goes on.
+        Where and in which direction each ray continues.
     """
 
     faces: NDArray[np.int32]
@@ -149,7 +149,7 @@ class _Front(NamedTuple):
 
 
 class _Generation(NamedTuple):
-    """Sequences of one number of reflections; fields as in :class:`Sequences`."""
+    """Sequences of the same number of reflections; fields as in :class:`Sequences`."""
 
     parents: NDArray[np.int32]
     planes: NDArray[np.int32]
@@ -158,7 +158,7 @@ class _Generation(NamedTuple):
 
     @classmethod
     def of_at_most(cls, count: int) -> "_Generation":
-        """Make room; what is never written takes no memory."""
+        """Allocate space; pages that are never written take no memory."""
         return cls(
             parents=np.empty(count, np.int32),
             planes=np.empty(count, np.int32),
@@ -191,27 +191,27 @@ def _reflect(
     columns: Any,
     front: Any,
 ) -> Any:
-    """End the rays' pieces of one depth at what they hit, and mirror them there.
+    """End the segments of one depth where the rays hit a plane, and reflect the rays there.
 
-    The rays that go on are moved to the front of the arrays of ``front``.
+    The rays that continue are moved to the beginning of the arrays of ``front``.
 
     Parameters
     ----------
     planes : _Mirrors
     first : int
-        Number of the first of ``parents``; their children follow on these.
+        Index of the first of ``parents``; the children's indices follow theirs.
     parents : _Generation
     children : _Generation
-        Room for the children; none when there are no more reflections.
+        Space for the children; empty at the last depth.
     table : ndarray of int32, all -1
-        Room for a hash table of the children; its length is a power of two, larger than their number.
+        Space for a hash table of the children; its length is a power of two, larger than their number.
     columns : _Columns
     front : _Front
 
     Returns
     -------
     num_on, num_children, num_lost : int
-        Rays that go on, sequences found, and rays that hit nothing.
+        Rays that continue, sequences found, and rays that hit nothing.
     """
     face_planes, normals, offsets = planes.face_planes, planes.normals, planes.offsets
     images, mirrors = parents.images, parents.mirrors
@@ -236,7 +236,7 @@ def _reflect(
             approach = nx * hx + ny * hy + nz * hz
             height = offsets[plane] - (nx * images[parent, 0] + ny * images[parent, 1] + nz * images[parent, 2])
             reach = height / approach
-        # A hit behind the ray's start is float32 noise at an edge: such a ray has slipped through and is lost.
+        # A hit behind the ray's start is float32 noise at an edge: the ray has passed through a gap and is lost.
         hit = plane >= 0 and np.isfinite(reach) and reach > length
         if not hit:
             num_lost += 1
@@ -244,15 +244,15 @@ def _reflect(
         end[ray, depth] = min(reach, max_path_length)
         if last or not hit or reach >= max_path_length:
             continue
-        place = _hashed(parent, plane) & (len(table) - 1)
-        child = table[place]
+        slot = _hashed(parent, plane) & (len(table) - 1)
+        child = table[slot]
         while child >= 0 and (child_parents[child] != parent + first or child_planes[child] != plane):
-            place = (place + 1) & (len(table) - 1)
-            child = table[place]
+            slot = (slot + 1) & (len(table) - 1)
+            child = table[slot]
         if child < 0:
             child = num_children
             num_children += 1
-            table[place] = child
+            table[slot] = child
             child_parents[child] = parent + first
             child_planes[child] = plane
             _mirror_at(
@@ -264,7 +264,7 @@ def _reflect(
                 child_mirrors[child],
             )
         hx, hy, hz = turned(child_mirrors, child, directions, ray)
-        # The side the ray came from: against its old heading.
+        # Towards the side that the ray came from.
         aside = -np.sign(approach) * offset
         rays[num_on] = ray
         faces[num_on] = faces[n]
@@ -292,7 +292,7 @@ def turned(mirrors: Any, sequence: Any, directions: Any, ray: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _hashed(parent: Any, plane: Any) -> Any:
-    """Spread pairs of numbers over the integers (Fibonacci hashing)."""
+    """Hash of a pair of indices (Fibonacci hashing)."""
     return np.int64(
         ((np.uint64(parent) << np.uint64(32)) ^ np.uint64(plane)) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(32)
     )

@@ -1,4 +1,4 @@
-"""Where rays leave a scene: the share of a station's rays that escape, and where most of them do."""
+"""Lost rays: the fraction of a station's rays that leave the scene, and where most of them do."""
 
 from dataclasses import dataclass
 
@@ -12,16 +12,16 @@ from rayfix_offline.site import StationSection
 from rayfix_offline.twin.twin import Twin
 
 LOST_RAYS_WARNING = 0.01
-"""More lost rays than this share mean that a scene has holes."""
+"""A scene that loses more than this fraction of its rays has holes."""
 
 RAY_SPACING = 0.03
-"""Of the rays of the check, rad: 14,000 rays for each station."""
+"""Spacing of the rays of the check, rad: 14,000 rays for each station."""
 
-MAX_LEGS = 4
-"""Legs of a ray that are looked at, whatever the site's number of reflections."""
+MAX_SEGMENTS = 4
+"""Largest number of segments of a ray that are checked, whatever the site's number of reflections."""
 
-PLACE_SIZE = 0.5
-"""Escaping rays are counted in cubes of this size, m, to find where most escape."""
+CUBE_SIZE = 0.5
+"""Side of the cubes in which lost rays are counted to find where most leave, m."""
 
 ENDLESS = 1e9
 """Longer than any path, m."""
@@ -34,15 +34,15 @@ class Escapes:
     Attributes
     ----------
     share : float
-        Of all rays, directly or after reflections.
+        Fraction of all rays that leave, directly or after reflections.
     side : str or None
-        Side of the bounding box that most of them leave by: "+x", "-x", and so on; None without any.
+        Side of the bounding box through which most of them leave: "+x", "-x", and so on; None if no ray leaves.
     side_share : float
-        Of the escaping rays, those that do.
+        Fraction of the lost rays that leave through it.
     place : tuple of float or None
-        Where most of them cross the border of the scene's bounding box, m; None without any.
+        Where most of them cross the scene's bounding box, m; None if no ray leaves.
     place_share : float
-        Of the escaping rays, those that do so within half a metre.
+        Fraction of the lost rays that cross it there, within half a metre.
     """
 
     station_id: str
@@ -54,15 +54,15 @@ class Escapes:
 
 
 def find_escapes(station: StationSection, twin: Twin, *, max_reflections: int) -> Escapes:
-    """Launch some thousand rays from a station and see which never meet a surface.
+    """Launch 14,000 rays from a station and find those that leave the scene.
 
     Parameters
     ----------
     max_reflections : int
-        Rays are followed over this many reflections, but over no more than ``MAX_LEGS`` legs.
+        Rays are traced over this many reflections, and over ``MAX_SEGMENTS`` segments at most.
     """
     rays = sample_rays(RAY_SPACING, np.random.default_rng(0))
-    legs = min(max_reflections + 1, MAX_LEGS)
+    depth = min(max_reflections + 1, MAX_SEGMENTS)
     segments = launch(
         np.array(station.position_m),
         rays.directions,
@@ -70,11 +70,11 @@ def find_escapes(station: StationSection, twin: Twin, *, max_reflections: int) -
         planes=twin.planes,
         reflectivity=constant_reflectivity(len(twin.scene.faces), loss_db=0.0),
         bounds=twin.scene.bounds,
-        max_reflections=legs,
+        max_reflections=depth,
         max_path_length=ENDLESS,
     )
-    # One leg more than is looked at: a ray without it has left the scene before.
-    lost = np.flatnonzero(segments.sequence[:, legs] < 0)
+    # One segment more than is checked: a ray without it has left the scene before.
+    lost = np.flatnonzero(segments.sequence[:, depth] < 0)
     share = len(lost) / len(rays)
     if not len(lost):
         return Escapes(station_id=station.id, share=share, side=None, side_share=0.0, place=None, place_share=0.0)
@@ -97,7 +97,7 @@ def find_escapes(station: StationSection, twin: Twin, *, max_reflections: int) -
 
 
 def _densest(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """Mean and number of the points of the fullest cube."""
-    cube = np.unique(np.floor(points / PLACE_SIZE), axis=0, return_inverse=True)[1].reshape(-1)
+    """Mean and number of the points in the cube that has most."""
+    cube = np.unique(np.floor(points / CUBE_SIZE), axis=0, return_inverse=True)[1].reshape(-1)
     fullest = np.bincount(cube).argmax()
     return points[cube == fullest].mean(axis=0), int(np.count_nonzero(cube == fullest))

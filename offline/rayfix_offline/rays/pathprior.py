@@ -1,8 +1,8 @@
-"""The path-selection prior: which of the paths to a place a station reports.
+"""The path-selection prior: the probability that a station reports a certain path of several.
 
-At a place x that paths k reach with power gains g_k, path k is reported with probability
-``pi_k(x) = g_k^beta / sum_j g_j^beta``. The sum is a voxel map, filled by all rays of an isotropic launch: a ray that
-stands for the solid angle dOmega fills ``s^2 dOmega ds`` of space between the lengths s and s + ds.
+At a position x that paths k reach with power gains g_k, path k is reported with probability
+``pi_k(x) = g_k^beta / sum_j g_j^beta``. The sum is stored as a voxel map, filled by all rays of an isotropic launch: a
+ray of solid angle dOmega covers the volume ``s^2 dOmega ds`` between the lengths s and s + ds.
 """
 
 from dataclasses import dataclass
@@ -28,9 +28,9 @@ class PathPrior:
     origin : ndarray of shape (3,), m
     voxel_size : float, m
     total : ndarray of shape (nx, ny, nz)
-        Mean over the voxel's free part; 0 where no ray comes.
+        Mean over the voxel's free part; 0 if no ray reaches it.
     coverage : tuple of float
-        Share of the free voxels that are reached with at most 0, 1, 2, ... reflections.
+        Fraction of the free voxels that are reached with at most 0, 1, 2, ... reflections.
     """
 
     origin: NDArray[np.float64]
@@ -40,7 +40,7 @@ class PathPrior:
 
 
 def reflection_factors(segments: Segments, exponent: float) -> NDArray[np.float64]:
-    """Factor that reflections put on gain^beta, shape (n_rays, max_reflections + 1)."""
+    """Factor of gain^beta due to reflections, shape (n_rays, max_reflections + 1)."""
     return np.asarray(10.0 ** (segments.log_gain * exponent))
 
 
@@ -52,7 +52,7 @@ def fill_path_prior(
     Parameters
     ----------
     exponent : float
-        beta; 0 takes any path for as likely, a large one only the strongest.
+        beta: with 0 all paths are equally probable, with a large one the strongest is reported.
     refinement : int
         A voxel of the map is this many voxels of the free space wide.
     jobs : int
@@ -64,7 +64,7 @@ def fill_path_prior(
     nx, ny, nz = free_space.free.shape
     padded[:nx, :ny, :nz] = free_space.free
     blocks = padded.reshape(shape[0], refinement, shape[1], refinement, shape[2], refinement)
-    free_share = blocks.mean(axis=(1, 3, 5))
+    free_fraction = blocks.mean(axis=(1, 3, 5))
     depths = segments.sequence.shape[1]
     factors = reflection_factors(segments, exponent)
 
@@ -84,9 +84,9 @@ def fill_path_prior(
     filled = over_ray_ranges(fill, len(rays), jobs)
     gain = sum((total for total, _ in filled[1:]), start=filled[0][0])
     first_reached = np.min([reached for _, reached in filled], axis=0)
-    # A voxel that a solid cuts is lit over its free part only; at least one free-space voxel's worth.
-    total = gain / voxel_size**3 / np.maximum(free_share, 1.0 / refinement**3)
-    free = free_share > 0.5
+    # Rays reach only the free part of a voxel that a solid cuts; it counts as one free-space voxel at least.
+    total = gain / voxel_size**3 / np.maximum(free_fraction, 1.0 / refinement**3)
+    free = free_fraction > 0.5
     count = max(1, int(np.count_nonzero(free)))
     coverage = tuple(float(np.count_nonzero(free & (first_reached <= k)) / count) for k in range(depths))
     return PathPrior(origin=free_space.origin, voxel_size=voxel_size, total=total, coverage=coverage)
@@ -115,13 +115,13 @@ def _fill(rays: Any, solid_angle: Any, exponent: Any, room: Any, total: Any, rea
             begin, stop = rays.start[ray, depth], rays.end[ray, depth]
             num_parts = walk(rays.images[seq], heading, begin, stop, room.origin, voxel, room.shape, lengths, voxels)
             for part in range(num_parts):
-                place, begin = voxels[part], lengths[part]
+                voxel_index, begin = voxels[part], lengths[part]
                 size = lengths[part + 1] - begin
-                if place < 0 or size <= 0.0:
+                if voxel_index < 0 or size <= 0.0:
                     continue
-                for share, portion in GAUSS:
-                    length = begin + share * size
-                    # Bounded next to the station, where a voxel's mean gain has no limit.
+                for node, weight in GAUSS:
+                    length = begin + node * size
+                    # Bounded next to the station, where the mean gain of a voxel diverges.
                     reach = max(length, 0.5 * voxel)
-                    total[place] += scale * portion * size * length * length / power(reach * reach, exponent)
-                reached[place] = min(reached[place], depth)
+                    total[voxel_index] += scale * weight * size * length * length / power(reach * reach, exponent)
+                reached[voxel_index] = min(reached[voxel_index], depth)

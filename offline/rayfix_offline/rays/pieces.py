@@ -1,10 +1,10 @@
-"""Ray pieces: every ray cut into overlapping slices of length, with the weight and moments of each slice.
+"""Ray pieces: rays cut into overlapping slices of path length, with the mass and the moments of each slice.
 
-The nodes of the slices are lengths in a constant ratio. A slice has the shape of a hat: it rises from the previous
-node to its own and falls to the next, so that slices add up to one everywhere. Moment-matched Gaussians of hats add
-up to a nearly flat density along a long ray (ripple 8 %), where those of abutting boxes leave deep valleys (39 %).
+The nodes of the slices are lengths in a constant ratio. A slice is a hat function: it rises linearly from the previous
+node to its own and falls to the next one, so that the slices add up to one. Moment-matched Gaussians of hat functions
+add up to a nearly constant density along a long ray (ripple 8 %); those of adjacent boxes do not (39 %).
 
-A piece is shared by all cells of all levels whose window the ray lies in.
+A piece is used by all cells whose window contains the ray.
 """
 
 from dataclasses import dataclass
@@ -25,14 +25,14 @@ from rayfix_offline.rays.voxelwalk import GAUSS, VoxelWalk, over_ray_ranges, pow
 
 @dataclass(frozen=True, kw_only=True)
 class Pieces:
-    """Pieces of all rays; those of ray r are ``offsets[r]`` to ``offsets[r + 1]``.
+    """Pieces of all rays. Those of ray r are ``offsets[r]`` to ``offsets[r + 1]``.
 
     Attributes
     ----------
     sequence : ndarray of int32, shape (n_pieces,)
     slice : ndarray of int16, shape (n_pieces,)
     mass : ndarray of shape (n_pieces,), m3 / sr
-        Integral of s^2 pi over the length, times the hat.
+        Integral over the length of s^2 pi times the hat function.
     mean : ndarray of shape (n_pieces,), m
         Mean path length under that weight.
     variance : ndarray of shape (n_pieces,), m2
@@ -47,7 +47,7 @@ class Pieces:
 
     @cached_property
     def num_slices(self) -> int:
-        """Number of slices that occur, counted from the station."""
+        """Number of slices up to the last one that occurs."""
         return int(self.slice.max(initial=-1)) + 1
 
     def of_rays(self, index: NDArray[np.int64]) -> "Pieces":
@@ -66,7 +66,7 @@ class Pieces:
 
 
 class _PieceArrays(NamedTuple):
-    """Columns of :class:`Pieces`, as the kernels fill them."""
+    """Columns of :class:`Pieces`, filled by the kernels."""
 
     sequence: NDArray[np.int32]
     slice: NDArray[np.int16]
@@ -140,7 +140,7 @@ def slice_nodes(longest: float, slice_ratio: float, first_node: float) -> NDArra
 
 @numba.njit(cache=True, nogil=True)
 def _last_slice(length: Any, nodes: Any, at_least: Any) -> Any:
-    """Last slice that a length belongs to: the first one whose node lies beyond it."""
+    """Last slice that a length belongs to: the first whose node is not below it."""
     n = at_least
     while nodes[n] < length:
         n += 1
@@ -149,7 +149,7 @@ def _last_slice(length: Any, nodes: Any, at_least: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _count(sequence: Any, start: Any, end: Any, nodes: Any) -> Any:
-    """Pieces of each ray: one for each slice that a segment has a part in."""
+    """Count the pieces of each ray: one for each slice that overlaps a segment."""
     counts = np.zeros(sequence.shape[0], np.int64)
     for ray in range(sequence.shape[0]):
         last = 0
@@ -208,21 +208,21 @@ def _cut(
             num_parts = walk(
                 rays.images[seq], heading, begin, stop, room.origin, room.voxel_size, room.shape, lengths, voxels
             )
-            peak = _last_slice(begin, nodes, first)  # the slice that rises where the walk is
+            peak = _last_slice(begin, nodes, first)  # the slice that rises at the present length
             low = nodes[peak - 1] if peak > 0 else 0.0
             sum0, sum1, sum2, sum3 = 0.0, 0.0, 0.0, 0.0  # moments about the last node, before the hats
             length = begin
             for part in range(num_parts):
-                # The path's probability, times length^(2 beta) and before it is capped to 1. A path so weak that its
-                # gain^beta is 0 is never reported, and outside of the map there is no place to be.
+                # The path's probability times length^(2 beta), before it is limited to 1. It is 0 outside of the map,
+                # and for a path so weak that its gain^beta is 0.
                 probability = 0.0
                 if voxels[part] >= 0 and rays.factors[ray, depth] > 0.0:
                     probability = rays.factors[ray, depth] / total[voxels[part]]  # infinite where the map is 0
                 while length < lengths[part + 1]:
                     reach = min(lengths[part + 1], nodes[peak])
-                    for share, portion in GAUSS:
-                        middle = length + share * (reach - length)
-                        weight = portion * (reach - length) * (middle * middle if by_volume else 1.0)
+                    for node, node_weight in GAUSS:
+                        middle = length + node * (reach - length)
+                        weight = node_weight * (reach - length) * (middle * middle if by_volume else 1.0)
                         if by_gain:
                             weight *= min(1.0, probability / power(middle * middle, exponent))
                         above = middle - low
@@ -232,7 +232,7 @@ def _cut(
                         sum3 += weight * above * above * above
                     length = reach
                     if length == nodes[peak] or length == stop:
-                        _share_out(peak, nodes, (sum0, sum1, sum2, sum3), at + peak - first, out)
+                        _split(peak, nodes, (sum0, sum1, sum2, sum3), at + peak - first, out)
                         sum0, sum1, sum2, sum3 = 0.0, 0.0, 0.0, 0.0
                         low = nodes[peak]
                         peak += 1
@@ -246,14 +246,14 @@ def _cut(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _share_out(peak: Any, nodes: Any, sums: Any, i: Any, out: Any) -> None:
-    """Share what lies between two nodes between the slice that rises there, piece i, and the one that falls.
+def _split(peak: Any, nodes: Any, sums: Any, i: Any, out: Any) -> None:
+    """Split the sums between two nodes between the slice that rises there, piece i, and the one that falls.
 
     The sums are moments about the lower node; those of each piece are taken about its own node.
     """
     sum0, sum1, sum2, sum3 = sums
     if peak == 0:
-        # The first slice takes all before its node.
+        # The first slice is constant before its node.
         node = nodes[0]
         out.mass[i] += sum0
         out.mean[i] += sum1 - node * sum0

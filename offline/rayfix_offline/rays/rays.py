@@ -18,7 +18,7 @@ class RaySet:
     ----------
     azimuth, zenith : ndarray of shape (n_rays,), rad
     solid_angle : ndarray of shape (n_rays,), sr
-        What each ray stands for.
+        Solid angle that each ray represents.
     """
 
     grid: AngularGrid
@@ -42,7 +42,7 @@ def sample_rays(spacing: float, rng: np.random.Generator) -> RaySet:
     ring = np.repeat(np.arange(grid.num_rings), grid.ring_cells)
     step = np.arange(grid.num_cells) - grid.ring_offsets[ring]
     azimuth = -np.pi + (step + rng.random(grid.num_cells)) * 2.0 * np.pi / grid.ring_cells[ring]
-    # Uniform in the cosine within the ring, so that each ray stands for the same solid angle as its cell.
+    # Uniform in the cosine within the ring, so that the directions are uniform on the sphere.
     high, low = np.cos(ring * np.pi / grid.num_rings), np.cos((ring + 1) * np.pi / grid.num_rings)
     zenith = np.arccos(high + (low - high) * rng.random(grid.num_cells))
     return RaySet(grid=grid, azimuth=azimuth, zenith=zenith, solid_angle=grid.solid_angles[ring])

@@ -1,4 +1,4 @@
-"""Straight pieces of rays, and the reflection sequences that they belong to."""
+"""Straight segments of rays, and the reflection sequences that they belong to."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, kw_only=True)
 class Sequences:
-    """Reflection sequences that rays went through; number 0 is the direct one.
+    """Reflection sequences of rays; sequence 0 is the direct path.
 
     Attributes
     ----------
     images : ndarray of shape (n_sequences, 3), m
-        The station, mirrored.
+        Mirror images of the station.
     mirrors : ndarray of shape (n_sequences, 3, 3)
-        Takes a launch direction to the direction after the last reflection.
+        Matrix that turns a launch direction into the direction after the last reflection.
     parents : ndarray of int32, shape (n_sequences,)
-        The sequence without its last reflection, -1 for the direct one.
+        Index of the sequence without its last reflection, -1 for the direct path.
     planes : ndarray of int32, shape (n_sequences,)
-        Plane of the last reflection, -1 for the direct one.
+        Plane of the last reflection, -1 for the direct path.
     num_reflections : ndarray of int8, shape (n_sequences,)
     """
 
@@ -33,18 +33,18 @@ class Sequences:
 
 @dataclass(frozen=True, kw_only=True)
 class Segments:
-    """Straight pieces of rays, one column per number of reflections.
+    """Straight segments of rays, one column for each number of reflections.
 
     Attributes
     ----------
     sequence : ndarray of int32, shape (n_rays, max_reflections + 1)
-        Reflection sequence of the piece, -1 where the ray has ended before.
+        Reflection sequence of the segment, -1 if the ray has ended before.
     start, end : ndarray of that shape, m
-        Path lengths at which the piece begins and ends.
+        Path lengths at which the segment begins and ends.
     log_gain : ndarray of that shape
-        Logarithm to base 10 of the share of the power that the reflections before the piece left, 0 before the first.
+        Logarithm to base 10 of the fraction of the power that remains after the reflections before the segment.
     lost_ray_share : float
-        Share of the rays that left the scene instead of hitting a surface.
+        Fraction of the rays that left the scene instead of hitting a surface.
     """
 
     sequence: NDArray[np.int32]
@@ -56,7 +56,7 @@ class Segments:
 
 
 class SegmentArrays(NamedTuple):
-    """Straight pieces of some rays, as the kernels read them.
+    """Straight segments of some rays, as the kernels read them.
 
     Attributes
     ----------
@@ -65,9 +65,9 @@ class SegmentArrays(NamedTuple):
     images, mirrors
         As in :class:`Sequences`.
     directions : ndarray of shape (n_rays, 3)
-        In which the rays are launched.
+        Launch directions.
     factors : ndarray of shape (n_rays, max_reflections + 1)
-        What the reflections before a piece put on gain^beta.
+        Factor of gain^beta due to the reflections before a segment.
     """
 
     sequence: NDArray[np.int32]
@@ -82,7 +82,7 @@ class SegmentArrays(NamedTuple):
     def of(
         cls, segments: Segments, directions: NDArray[np.float64], factors: NDArray[np.float64], first: int, stop: int
     ) -> "SegmentArrays":
-        """Pieces of the rays from ``first`` to before ``stop``."""
+        """Segments of the rays from ``first`` to before ``stop``."""
         return cls(
             sequence=segments.sequence[first:stop],
             start=segments.start[first:stop],

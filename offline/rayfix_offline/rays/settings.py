@@ -1,4 +1,4 @@
-"""Numbers that decide which rays are launched, and what becomes of them."""
+"""Numbers that decide which rays are launched and how they are cut."""
 
 from dataclasses import dataclass
 
@@ -10,11 +10,11 @@ class RaySettings:
     Attributes
     ----------
     rays_per_window : float
-        Rays lie this many times as close as the finest window's standard deviation.
+        Standard deviation of the finest window divided by the spacing of rays.
     cells_per_window : float
-        Cells are this many times as close as their window's standard deviation.
+        Standard deviation of a window divided by the spacing of its cells.
     mirror_offset : float
-        A reflected ray starts this times (1 + largest coordinate in m) off its mirror.
+        A reflected ray starts at this times (1 + largest coordinate in m) from its mirror.
     first_node : float, m
         Path length of the first slice node; shorter lengths belong to the first slice.
     slice_ratio : float
@@ -22,9 +22,9 @@ class RaySettings:
     prior_refinement : int
         Width of a voxel of the path prior, in voxels of the free space.
     prior_rays : float
-        At the far end of the scene, the rays that fill the path prior lie this many of its voxels apart, or closer.
+        Largest spacing of the rays that fill the path prior, at the far end of the scene, in voxels of its map.
     prior_spacing : float, rad
-        Rays that are launched for the path prior only are not closer than this.
+        Smallest spacing of rays that are launched for the path prior only.
     """
 
     rays_per_window: float = 3.0

@@ -1,4 +1,4 @@
-"""Reflection sequences that run over the same surfaces."""
+"""Reflection sequences of the same surfaces."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,18 +8,18 @@ from rayfix_offline.twin.planes import Planes
 
 
 def surface_sequences(sequences: Sequences, planes: Planes) -> NDArray[np.int64]:
-    """Find the reflection sequences that run over the same surfaces in the same order.
+    """Find the reflection sequences of the same surfaces in the same order.
 
     Returns
     -------
     ndarray of int64, shape (n_sequences,)
-        The first of those that run as each one does; itself where nothing is curved.
+        First of the sequences that are equivalent to each one; itself where nothing is curved.
     """
     out = np.arange(len(sequences.parents))
     if planes.curved:
         for depth in range(1, int(sequences.num_reflections.max()) + 1):
             mine = np.flatnonzero(sequences.num_reflections == depth)
-            way = out[sequences.parents[mine]] * len(planes) + planes.surfaces[sequences.planes[mine]]
-            _, first, same = np.unique(way, return_index=True, return_inverse=True)
+            key = out[sequences.parents[mine]] * len(planes) + planes.surfaces[sequences.planes[mine]]
+            _, first, same = np.unique(key, return_index=True, return_inverse=True)
             out[mine] = mine[first[same]]
     return out

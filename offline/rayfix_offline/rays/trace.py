@@ -1,4 +1,4 @@
-"""All rays of one station, traced once and cut into the pieces that the cells of its finest level share."""
+"""The rays of one station: launched, cut into pieces and weighted by the path prior."""
 
 import hashlib
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from rayfix_tables.grid import AngularGrid
 
 @dataclass(frozen=True, kw_only=True)
 class LevelRays:
-    """What the cells of a level are fitted to.
+    """Rays that the cells of a level are fitted to.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class LevelRays:
         Standard deviation of the cells' window.
     ray_spacing : float, rad
     surface_sequences : ndarray of int64, shape (n_sequences,)
-        First of the sequences that run over the same surfaces as each one does; their groups are joined.
+        First of the sequences of the same surfaces as each one; their groups are joined.
     """
 
     window: float
@@ -43,16 +43,16 @@ class LevelRays:
 
 @dataclass(frozen=True, kw_only=True)
 class StationTrace:
-    """A station's rays and what the launch found out.
+    """A station's rays and the statistics of the launch.
 
     Attributes
     ----------
     finest : LevelRays
-        For the finest level; the cells of the others are sums of its cells.
+        Rays of the finest level; the cells of the other levels are sums of its cells.
     lost_ray_share : float
-        Share of the rays that left the scene instead of hitting a surface.
+        Fraction of the rays that left the scene instead of hitting a surface.
     coverage : tuple of float
-        Share of the free space that is reached with at most 0, 1, 2, ... reflections.
+        Fraction of the free space that is reached with at most 0, 1, 2, ... reflections.
     """
 
     finest: LevelRays
@@ -60,12 +60,12 @@ class StationTrace:
     coverage: tuple[float, ...]
 
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        """Return what the launch found out, as the arrays of a shard."""
+        """Return the statistics of the launch as the arrays of a shard."""
         return {"lost_ray_share": np.array(self.lost_ray_share), "coverage": np.array(self.coverage)}
 
 
 def level_grid(window: float, *, cells_per_window: float = RaySettings.cells_per_window) -> AngularGrid:
-    """Grid of the cells of a window [rad], which are this many times as close as its standard deviation."""
+    """Grid of the cells of a window [rad]; their spacing is its standard deviation / ``cells_per_window``."""
     return AngularGrid.from_spacing(window / cells_per_window)
 
 
@@ -78,7 +78,7 @@ def prior_spacing(twin: Twin, settings: RaySettings | None = None) -> float:
 
 
 def reflectivity_of(site: SiteFile, twin: Twin, settings: ReflectionSettings | None = None) -> Reflectivity:
-    """Return what the triangles of a site's scene reflect."""
+    """Return the reflectivity of the triangles of a site's scene."""
     propagation, scene = site.propagation, twin.scene
     if propagation.reflection == "constant":
         return constant_reflectivity(len(scene.faces), loss_db=propagation.reflection_loss_db)
@@ -100,9 +100,9 @@ def trace_station(
     reflection: ReflectionSettings | None = None,
     jobs: int = 1,
 ) -> StationTrace:
-    """Launch a station's rays and cut them into pieces.
+    """Trace a station's rays and cut them into pieces.
 
-    The directions depend on the site's seed and the station's id alone.
+    The directions depend only on the site's seed and the station's id.
 
     Parameters
     ----------

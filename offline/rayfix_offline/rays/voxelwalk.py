@@ -1,9 +1,9 @@
-"""Straight pieces of rays through a voxel map: where they cross from one voxel into the next.
+"""Traversal of a voxel map: where a straight segment of a ray crosses from one voxel into the next.
 
 J. Amanatides, A. Woo, "A fast voxel traversal algorithm for ray tracing", Eurographics 1987.
 
-Between two crossings all that a map says is constant, and what is left to integrate is smooth: the three points of
-Gauss are exact for polynomials of degree five.
+Between two crossings the map is constant and the integrand smooth: the three-point Gauss rule is exact for polynomials
+of degree five.
 """
 
 from collections.abc import Callable
@@ -16,19 +16,19 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 GAUSS = ((0.5 - 0.15**0.5, 5.0 / 18.0), (0.5, 8.0 / 18.0), (0.5 + 0.15**0.5, 5.0 / 18.0))
-"""Gauss' three points: the share of the interval that lies before each, and that which it stands for."""
+"""Three-point Gauss rule on [0, 1]: nodes and weights."""
 
 RAY_RANGES = 8
-"""Rays are worked on in this many ranges, on however many threads: sums have the same rounding on any machine."""
+"""Number of ranges of rays, whatever the number of threads: sums are rounded alike on any machine."""
 
 
 def over_ray_ranges(run: Callable[[int, int], Any], num_rays: int, jobs: int) -> list[Any]:
-    """Call a function that releases the interpreter's lock for each range of rays, and list what it returns.
+    """Call a function that releases the interpreter's lock for each range of rays; return a list of its results.
 
     Parameters
     ----------
     run : callable
-        Called with the first ray and the one behind the last.
+        Called with the indices of the first ray and of the one after the last.
     jobs : int
         Threads; -1 for one per core.
     """
@@ -38,7 +38,7 @@ def over_ray_ranges(run: Callable[[int, int], Any], num_rays: int, jobs: int) ->
 
 
 class VoxelWalk(NamedTuple):
-    """A voxel map, and room for the crossings that :func:`walk` finds in it.
+    """A voxel map and the buffers of :func:`walk`.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class VoxelWalk(NamedTuple):
     shape : tuple of 3 ints
         Voxels along each axis.
     lengths, voxels : ndarray
-        Room of :func:`new_crossings`.
+        Buffers of :func:`new_crossings`.
     """
 
     origin: NDArray[np.float64]
@@ -59,12 +59,12 @@ class VoxelWalk(NamedTuple):
 
     @classmethod
     def of(cls, origin: NDArray[np.float64], voxel_size: float, shape: tuple[int, ...]) -> "VoxelWalk":
-        """Walk of a map of a shape."""
+        """Allocate the buffers for a map of a shape."""
         return cls(origin, voxel_size, shape, *new_crossings(shape))
 
 
 def new_crossings(shape: tuple[int, ...]) -> tuple[Any, Any]:
-    """Room for the crossings that :func:`walk` finds in a map of a shape."""
+    """Allocate the buffers of :func:`walk` for a map of a shape."""
     most = sum(shape) + 3
     return np.empty(most + 1), np.empty(most, np.int64)
 
@@ -73,12 +73,12 @@ def new_crossings(shape: tuple[int, ...]) -> tuple[Any, Any]:
 def walk(
     image: Any, heading: Any, begin: Any, stop: Any, origin: Any, voxel: Any, shape: Any, lengths: Any, voxels: Any
 ) -> Any:
-    """Cut a straight piece at the faces of voxels.
+    """Cut a straight segment at the faces of voxels.
 
     Parameters
     ----------
     image : ndarray of shape (3,), m
-        The piece runs on ``image + length * heading``.
+        The segment is part of the line ``image + length * heading``.
     heading : tuple of 3 floats
         Unit vector.
     begin, stop : float, m
@@ -89,8 +89,8 @@ def walk(
     shape : tuple of 3 ints
         Voxels along each axis.
     lengths, voxels : ndarray
-        Room of :func:`new_crossings`. Part k runs from ``lengths[k]`` to ``lengths[k + 1]`` in ``voxels[k]``, which
-        counts through the map in C order; -1 outside of it. A part may be empty.
+        Buffers of :func:`new_crossings`. Part k extends from ``lengths[k]`` to ``lengths[k + 1]`` in ``voxels[k]``, the
+        index of the voxel in C order, -1 outside of the map. A part may be empty.
 
     Returns
     -------
@@ -118,26 +118,26 @@ def walk(
     x, step_x, left_x, next_x, far_x = _axis(image[0], heading[0], enter, origin[0], voxel, shape[0])
     y, step_y, left_y, next_y, far_y = _axis(image[1], heading[1], enter, origin[1], voxel, shape[1])
     z, step_z, left_z, next_z, far_z = _axis(image[2], heading[2], enter, origin[2], voxel, shape[2])
-    place = (x * shape[1] + y) * shape[2] + z
+    index = (x * shape[1] + y) * shape[2] + z
     step_x *= shape[1] * shape[2]
     step_y *= shape[2]
     length = enter
     while True:
-        voxels[count] = place
+        voxels[count] = index
         count += 1
         if next_x <= next_y and next_x <= next_z:
             length = max(length, next_x)
-            place += step_x
+            index += step_x
             left_x -= 1
             next_x = next_x + far_x if left_x > 0 else np.inf
         elif next_y <= next_z:
             length = max(length, next_y)
-            place += step_y
+            index += step_y
             left_y -= 1
             next_y = next_y + far_y if left_y > 0 else np.inf
         else:
             length = max(length, next_z)
-            place += step_z
+            index += step_z
             left_z -= 1
             next_z = next_z + far_z if left_z > 0 else np.inf
         if length >= leave:
@@ -153,12 +153,12 @@ def walk(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _axis(image: Any, heading: Any, enter: Any, origin: Any, voxel: Any, size: Any) -> Any:
-    """Prepare a walk along one axis.
+    """Prepare the traversal along one axis.
 
     Returns
     -------
     first, step, left : int
-        Voxel at the length ``enter``, and by how much and how often it can change.
+        Voxel at the length ``enter``, the step to the next one, and the number of steps left.
     next_length, length : float, m
         Path length at the first change, and between changes.
     """
@@ -174,7 +174,7 @@ def _axis(image: Any, heading: Any, enter: Any, origin: Any, voxel: Any, size: A
 
 @numba.njit(cache=True, nogil=True)
 def power(base: Any, exponent: Any) -> Any:
-    """Raise to a power from 0 on; fast where the exponent is a small whole number, as it mostly is."""
+    """Raise to a power of at least 0; fast for small integers, the usual case."""
     whole = int(exponent)
     if whole != exponent or whole > 4:
         return base**exponent

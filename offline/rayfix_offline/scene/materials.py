@@ -1,7 +1,7 @@
-"""What building materials reflect: permittivities of ITU-R P.2040-3 and Fresnel's coefficients.
+"""Reflection by building materials: permittivities of ITU-R P.2040-3 and Fresnel's coefficients.
 
-A wall counts as a half space, so what comes back from its far side is left out. Both polarisations count alike, since
-a report does not tell how the transmitter holds its antenna.
+A wall is modelled as a half space: reflections from its far side are neglected. The power is averaged over both
+polarisations, because the orientation of the transmitter's antenna is not known.
 """
 
 import re
@@ -20,13 +20,13 @@ class ReflectionSettings:
 
     Attributes
     ----------
-    least_power : float
+    min_power : float
         A reflection leaves at least this fraction of the power, so that logarithms are finite.
     grazing_cosine : float
         Below this cosine of the angle of incidence, any material reflects all of the power.
     """
 
-    least_power: float = 1e-12
+    min_power: float = 1e-12
     grazing_cosine: float = 1e-12
 
 
@@ -37,7 +37,7 @@ class ItuParameters:
     Attributes
     ----------
     lowest_ghz, highest_ghz : float
-        Where the row holds.
+        Frequency range of the row.
     a, b : float
         Real part of the relative permittivity: ``a f^b``.
     c, d : float
@@ -78,12 +78,12 @@ ITU_MATERIALS = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reflectivity:
-    """How much power each triangle reflects.
+    """Reflected power of each triangle.
 
     Attributes
     ----------
     permittivity : ndarray of complex, shape (n_faces,)
-        Complex relative permittivity of each triangle; NaN where the constant loss holds.
+        Complex relative permittivity of each triangle; NaN if the constant loss applies.
     loss_db : float
         The constant loss.
     settings : ReflectionSettings
@@ -94,7 +94,7 @@ class Reflectivity:
     settings: ReflectionSettings = field(default_factory=ReflectionSettings)
 
     def log_gain(self, faces: NDArray[np.int32], cos_incidence: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Logarithm to base 10 of the reflected share of the power.
+        """Logarithm to base 10 of the reflected fraction of the power.
 
         Parameters
         ----------
@@ -108,16 +108,16 @@ class Reflectivity:
         if known.any():
             grazing = self.settings.grazing_cosine
             power = fresnel_power(cos_incidence[known], permittivity[known], grazing_cosine=grazing)
-            out[known] = np.log10(np.maximum(power, self.settings.least_power))
+            out[known] = np.log10(np.maximum(power, self.settings.min_power))
         return out
 
     def power(self, faces: NDArray[np.int32], cos_incidence: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Reflected share of the power; see :meth:`log_gain`."""
+        """Reflected fraction of the power; see :meth:`log_gain`."""
         return np.asarray(10.0 ** self.log_gain(faces, cos_incidence))
 
 
 def constant_reflectivity(num_faces: int, *, loss_db: float) -> Reflectivity:
-    """Return triangles that all have the same loss, whatever they are made of."""
+    """Return the same loss for all triangles, whatever their material."""
     return Reflectivity(permittivity=np.full(num_faces, np.nan, np.complex128), loss_db=loss_db)
 
 
@@ -129,7 +129,7 @@ def itu_reflectivity(
     loss_db: float,
     settings: ReflectionSettings | None = None,
 ) -> Reflectivity:
-    """Return triangles that reflect as their materials do.
+    """Return the reflectivity of triangles according to their materials.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def complex_permittivity(name: str, carrier_ghz: float) -> complex | None:
     Returns
     -------
     complex or None
-        ``a f^b - j c f^d / (2 pi f eps0)``; None for a material or a frequency that the table does not have.
+        ``a f^b - j c f^d / (2 pi f eps0)``; None for a material or a frequency that is not in the table.
     """
     plain = itu_name(name)
     for row in ITU_MATERIALS[plain] if plain else ():
@@ -193,7 +193,7 @@ def complex_permittivity(name: str, carrier_ghz: float) -> complex | None:
 def fresnel_power(
     cos_incidence: ArrayLike, permittivity: ArrayLike, *, grazing_cosine: float = ReflectionSettings.grazing_cosine
 ) -> NDArray[np.float64]:
-    """Share of the power that a half space reflects, the mean of both polarisations.
+    """Fraction of the power that a half space reflects, the mean of both polarisations.
 
     With the coefficients r_TE and r_TM of ITU-R P.2040-3 for a single interface and a wave that comes from air.
 

@@ -1,4 +1,4 @@
-"""Triangles that are in a mesh twice: they would make the inside of a solid its outside."""
+"""Duplicate triangles, which would turn a solid inside out."""
 
 from dataclasses import dataclass
 
@@ -10,30 +10,30 @@ from rayfix_offline.twin.mesh import Mesh
 
 
 @dataclass(frozen=True, kw_only=True)
-class Repeats:
-    """Triangles with the same three corners.
+class Duplicates:
+    """Triangles that have all three corners in common with another one.
 
     Attributes
     ----------
-    needless : ndarray of bool, shape (n_faces,)
-        Copies within an object, and the back sides of objects that are drawn from both sides throughout.
+    redundant : ndarray of bool, shape (n_faces,)
+        Copies within an object, and back faces of objects that are double-sided throughout.
     num_copies, num_backs : int
-        Of the needless triangles, those that face as their originals do, and those that do not.
+        Redundant triangles of the same orientation as their originals, and of the opposite one.
     coinciding : tuple of (str, str)
-        Objects that share a triangle which faces the same way in both.
+        Pairs of objects that share a triangle of the same orientation.
     """
 
-    needless: NDArray[np.bool_]
+    redundant: NDArray[np.bool_]
     num_copies: int
     num_backs: int
     coinciding: tuple[tuple[str, str], ...]
 
 
-def find_repeats(mesh: Mesh) -> Repeats:
-    """Find the triangles that are in a mesh more than once; :meth:`Mesh.without` leaves the needless ones out.
+def find_duplicates(mesh: Mesh) -> Duplicates:
+    """Find duplicate triangles; :meth:`Mesh.without` removes the redundant ones.
 
-    Two triangles back to back within an object stay, where others of the part have none: boxes that touch are drawn
-    like that.
+    A pair of triangles back to back within an object remains where other triangles of the part have no back face: that
+    is how touching boxes are drawn.
     """
     scene, topology = mesh.scene, mesh.topology
     count = len(scene.faces)
@@ -52,12 +52,12 @@ def find_repeats(mesh: Mesh) -> Repeats:
     left = ~copies
     single = np.bincount(alike[left], minlength=count)[alike] == 1
     doubled = np.bincount(part, weights=single & left)[part] == 0
-    # A flat sheet with a back is a closed part of no volume; without it, it is an open one. Neither is a solid.
+    # A double-sided sheet is a closed part without volume, a single-sided one is open. Neither is a solid.
     backs = np.zeros(count, bool)
     backs[left] = _later(alike[left])
     backs &= doubled
-    return Repeats(
-        needless=copies | backs,
+    return Duplicates(
+        redundant=copies | backs,
         num_copies=int(np.count_nonzero(copies)),
         num_backs=int(np.count_nonzero(backs)),
         coinciding=_coinciding(scene, sided[left], scene.face_objects[left]),

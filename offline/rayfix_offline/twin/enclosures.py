@@ -1,4 +1,4 @@
-"""Which closed parts are the building, inside of which everything is, and which are solids, in which nothing can be."""
+"""Closed parts: buildings, which contain the free space, and solids, which do not."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,16 +13,16 @@ from rayfix_offline.twin.solids import Part, is_inside, touched
 
 @dataclass(frozen=True, kw_only=True)
 class Enclosures:
-    """What the closed parts of a scene are.
+    """Classification of the parts of a scene.
 
     Attributes
     ----------
     enclosing : ndarray of bool, shape (n_parts,)
-        The part is a building, or the inner or outer face of its walls; every other closed part is a solid.
+        The part is a building, or the inner or outer face of its walls. Every other closed part is a solid.
     rooms : ndarray of bool, shape (n_parts,)
-        The innermost of them: free space is inside one of these.
+        The innermost of these; free space lies inside one of them.
     inside : ndarray of bool, shape (n_parts, n_stations)
-        The station is in the closed part, or on its surface.
+        The station is inside the closed part or on its surface.
     """
 
     enclosing: NDArray[np.bool_]
@@ -33,15 +33,15 @@ class Enclosures:
 def find_enclosures(
     scene: Scene, parts: Sequence[Part], stations: NDArray[np.float64], settings: TwinSettings | None = None
 ) -> Enclosures:
-    """Tell buildings from solids.
+    """Distinguish buildings from solids.
 
-    A closed part with a station in it is a building or a solid that the station was misplaced into. What lies in such
-    parts and what lies beside them decides: stations, and closed parts without any.
+    A closed part that contains a station is a building, or a solid with a misplaced station. The objects inside and
+    outside of such parts decide; objects are stations, and closed parts without a station.
 
-    - A part in no other is a building if it is large, and holds most stations, or more lies in such parts than beside
-      them, or its triangles face inwards.
-    - A part in another is the inner face of walls, or one room of several, if more lies in such parts than beside them,
-      and they fill most of the outer one, or something is in it.
+    - An outermost part is a building if it is large and one of these holds: it contains most stations; more objects lie
+      inside of such parts than outside; its triangles face inwards.
+    - A part inside another is the inner face of walls, or one room of several, if more objects lie inside of such parts
+      than outside, and either they fill most of the outer part or the part contains an object.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def _container(
     boxes: NDArray[np.float64],
     touch: float,
 ) -> int:
-    """Smallest part with stations that part i lies in, -1 for none."""
+    """Smallest part with stations that contains part i, -1 for none."""
     around = [
         j
         for j in candidates
@@ -126,11 +126,11 @@ def _container(
 def _contents(
     scene: Scene, parts: Sequence[Part], candidates: list[int], boxes: NDArray[np.float64], max_parts: int
 ) -> NDArray[np.bool_]:
-    """Which closed parts without stations lie in the candidates, shape (n_candidates, n_looked_at)."""
+    """Which closed parts without stations lie inside the candidates, shape (n_candidates, n_sampled)."""
     others = [i for i, part in enumerate(parts) if part.closed and i not in set(candidates)]
-    looked_at = others[:: max(1, -(-len(others) // max_parts))]
-    out = np.zeros((len(candidates), len(looked_at)), bool)
-    middles = np.array([scene.triangles[parts[k].faces].mean(axis=(0, 1)) for k in looked_at]).reshape(-1, 3)
+    sampled = others[:: max(1, -(-len(others) // max_parts))]
+    out = np.zeros((len(candidates), len(sampled)), bool)
+    middles = np.array([scene.triangles[parts[k].faces].mean(axis=(0, 1)) for k in sampled]).reshape(-1, 3)
     for n, i in enumerate(candidates):
         triangles = scene.triangles[parts[i].faces]
         for m in np.flatnonzero(np.all((middles > boxes[i, 0]) & (middles < boxes[i, 1]), axis=1)):

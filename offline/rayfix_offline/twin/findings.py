@@ -1,4 +1,4 @@
-"""What is wrong with a scene or a site, and the remedy for each."""
+"""Findings: problems of a scene or a site, each with its remedy."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from rayfix_offline.scene.engine import FAR
 from rayfix_offline.scene.materials import ITU_MATERIALS, complex_permittivity, itu_name
 from rayfix_offline.scene.scene import METRES_PER_UNIT, Scene
 from rayfix_offline.site import SiteFile, StationSection
-from rayfix_offline.twin.cleaning import Repeats
+from rayfix_offline.twin.cleaning import Duplicates
 from rayfix_offline.twin.enclosures import Enclosures
 from rayfix_offline.twin.solids import Part, touched
 
 LARGE_SCENE, SMALL_SCENE = 1000.0, 1.0
-"""A scene larger or smaller than this has probably another unit, m."""
+"""A scene larger or smaller than this probably has another unit, m."""
 
 COARSE = 0.005
 """A table that holds positions no finer than this, m, is not built."""
@@ -26,20 +26,20 @@ MOST_NAMES = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Something about the site that its author should know.
+    """A problem of a site or its scene.
 
     Attributes
     ----------
     severity : {"error", "warning"}
         An error stops the build.
     kind : str
-        What it is about, in one or two words; the same for all findings of a kind.
+        Topic in one or two words, the same for all findings of a kind.
     problem : str
-        What is wrong, and where.
+        The problem and where it is.
     remedy : str
-        What to do about it.
+        How to solve it.
     station_id : str, optional
-        Of the station that it is about.
+        Station that it concerns.
     """
 
     severity: Literal["error", "warning"]
@@ -65,7 +65,7 @@ def error(kind: str, problem: str, remedy: str, *, station_id: str | None = None
 
 
 def size_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
-    """Check unit, upward axis and place of the scene."""
+    """Check the scene's unit, upward axis and distance from the origin."""
     extent = scene.bounds[1] - scene.bounds[0]
     size = " x ".join(f"{length:,.6g}" for length in extent)
     if extent.max() > LARGE_SCENE:
@@ -99,19 +99,21 @@ def file_findings(scene: Scene) -> Iterator[Finding]:
         yield warning(remark.kind, remark.problem, remark.remedy)
 
 
-def mesh_findings(scene: Scene, repeats: Repeats, parts: Sequence[Part], enclosures: Enclosures) -> Iterator[Finding]:
-    """Find triangles and parts that a clean mesh does not have."""
+def mesh_findings(
+    scene: Scene, duplicates: Duplicates, parts: Sequence[Part], enclosures: Enclosures
+) -> Iterator[Finding]:
+    """Find defects of the mesh."""
     if scene.num_degenerate:
-        problem = f"{scene.num_degenerate} triangles have no area and are left out"
+        problem = f"{scene.num_degenerate} triangles have no area and are removed"
         yield warning("degenerate", problem, "clean the mesh")
-    if repeats.num_copies:
-        problem = f"{repeats.num_copies} triangles are there twice and are left out"
+    if duplicates.num_copies:
+        problem = f"{duplicates.num_copies} duplicate triangles are removed"
         yield warning("duplicate", problem, "remove duplicate faces from the mesh")
-    if repeats.num_backs:
-        problem = f"{repeats.num_backs} triangles are the back sides of others and are left out"
-        yield warning("duplicate", problem, "export one side only: either side reflects")
-    if repeats.coinciding:
-        pairs = [f"{a} and {b}" for a, b in repeats.coinciding]
+    if duplicates.num_backs:
+        problem = f"{duplicates.num_backs} triangles are back faces of others and are removed"
+        yield warning("duplicate", problem, "export single-sided faces: both sides reflect")
+    if duplicates.coinciding:
+        pairs = [f"{a} and {b}" for a, b in duplicates.coinciding]
         yield warning("duplicate", f"objects that coincide, wholly or in part: {_listed(pairs)}", "keep one of them")
     sheets = [part for part in parts if not part.closed]
     if sheets:
@@ -179,15 +181,15 @@ def material_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
 def station_findings(
     site: SiteFile, scene: Scene, parts: Sequence[Part], enclosures: Enclosures, *, touch: float
 ) -> Iterator[Finding]:
-    """Find stations where none can be; one nearer than ``touch`` [m] to a surface lies on it."""
+    """Find stations at impossible positions; one nearer than ``touch`` [m] to a surface lies on it."""
     outside = _what_would_hold_stations(site, scene) or "correct position_m or scene_unit"
     for s, station in enumerate(site.stations):
         position = np.array(station.position_m)
-        place = _placed(station)
+        located = _located(station)
         problem = _misplacement(position, scene, parts, enclosures, s, touch)
         if problem is not None:
             where, remedy = problem
-            yield error("station", f"{place} lies {where}", remedy or outside, station_id=station.id)
+            yield error("station", f"{located} lies {where}", remedy or outside, station_id=station.id)
 
 
 def _misplacement(
@@ -198,7 +200,7 @@ def _misplacement(
     station: int,
     touch: float,
 ) -> tuple[str, str] | None:
-    """Where a station is that cannot be there, and the remedy, empty where it is far off; None where all is well."""
+    """Where a misplaced station lies, and the remedy, which is empty far from the scene; None for a valid position."""
     low, high = scene.bounds
     if np.any(position < low) or np.any(position > high):
         box = " to ".join(f"({', '.join(f'{v:g}' for v in corner)})" for corner in (low, high))
@@ -216,7 +218,7 @@ def _misplacement(
 
 
 def _what_would_hold_stations(site: SiteFile, scene: Scene) -> str | None:
-    """Return the unit or the upward axis with which all stations would lie inside; None when they do, or none does."""
+    """Return the unit or the upward axis with which all stations would lie inside; None if they do, or with none."""
     positions = np.array([station.position_m for station in site.stations])
 
     def held(bounds: NDArray[np.float64]) -> bool:
@@ -238,18 +240,18 @@ def _other_axis(site: SiteFile) -> str:
 
 
 def _turned(bounds: NDArray[np.float64], up: str) -> NDArray[np.float64]:
-    """Bounds of a scene that was read with this axis up, as if it were the other one."""
+    """Bounds of a scene that was read with this axis up, if the other one were up."""
     x, y, z = bounds.T
     turned = (x, z, -y) if up == "y" else (x, -z, y)
     return np.sort(np.stack(turned, axis=1), axis=0)
 
 
-def _placed(station: StationSection) -> str:
+def _located(station: StationSection) -> str:
     return f"station '{station.id}' at ({', '.join(f'{v:g}' for v in station.position_m)}) m"
 
 
 def _names(parts: Sequence[Part]) -> str:
-    """Name parts; a number alone would not help to find them."""
+    """Name parts, numbered ones with their position: a number alone would not help to find them."""
     return _listed(
         [
             f"{part.name} at ({', '.join(f'{v:.1f}' for v in part.middle)})" if "#" in part.name else part.name

@@ -1,4 +1,4 @@
-"""The mesh of a scene: its triangles, and how they are connected."""
+"""The mesh of a scene: its triangles and their connectivity."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +13,7 @@ from rayfix_offline.twin.topology import Topology, find_topology
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh:
-    """Triangles of a scene with their topology. Each step of a repair takes one and returns another.
+    """Triangles of a scene and their topology; a step of a repair takes a mesh and returns a mesh.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Mesh:
         return find_topology(self.scene, weld=self.weld)
 
     def without(self, faces: NDArray[np.bool_]) -> "Mesh":
-        """Leave out triangles, given by a mask of shape (n_faces,)."""
+        """Return the mesh without some triangles, given by a mask of shape (n_faces,)."""
         if not faces.any():
             return self
         scene = self.scene

@@ -1,4 +1,4 @@
-"""Coplanar triangles as one mirror plane."""
+"""Mirror planes: coplanar triangles are merged into one."""
 
 from dataclasses import dataclass
 
@@ -17,12 +17,12 @@ class Planes:
     Attributes
     ----------
     normals : ndarray of shape (n_planes, 3)
-        Unit normals; either side reflects.
+        Unit normals; both sides reflect.
     offsets : ndarray of shape (n_planes,), m
     face_planes : ndarray of int32, shape (n_faces,)
         Plane of each triangle.
     surfaces : ndarray of int32, shape (n_planes,)
-        Surface that each plane belongs to: the facets of a curved one have it in common.
+        Surface of each plane; the facets of a curved surface share one.
     """
 
     normals: NDArray[np.float64]
@@ -37,7 +37,7 @@ class Planes:
 
     @property
     def curved(self) -> bool:
-        """Whether planes have a surface in common."""
+        """Whether some planes share a surface."""
         return self.num_surfaces < len(self)
 
     def __len__(self) -> int:
@@ -51,7 +51,7 @@ def merge_coplanar(
     tolerance: float = TwinSettings.plane_tolerance,
     rounding: float = TwinSettings.plane_rounding,
 ) -> Planes:
-    """Find the planes of triangles; triangles of one plane need not touch, and each plane is a surface by itself.
+    """Merge coplanar triangles into planes; they need not touch. Each plane is a surface of its own.
 
     Parameters
     ----------
@@ -69,10 +69,10 @@ def merge_coplanar(
     normals = crosses / areas[:, None]
     offsets = np.einsum("ij,ij->i", normals, triangles.mean(axis=1) - centre)
 
-    # A plane has two normals: both go in, and belong together, so that no sign convention can split a plane.
+    # A plane has two normals. Both are used and linked, so that no sign convention can split a plane.
     features = np.concatenate([normals * radius, offsets[:, None]], axis=1)
     both = np.concatenate([features, -features])
-    # Rounded first: the pairs among thousands of triangles of one floor would be millions.
+    # Rounding comes first: thousands of triangles of one floor would have millions of pairs.
     step = rounding * tolerance
     steps = np.round(both / step)
     inverse = number_rows(steps)
@@ -84,7 +84,7 @@ def merge_coplanar(
     _, first, face_planes = np.unique(labels[inverse[:count]], return_index=True, return_inverse=True)
     first, face_planes = _unchained(features, first, face_planes, tolerance)
 
-    # The mean over the plane's area: all rays of one reflection sequence then share one exact mirror image.
+    # The mean over the plane's area, so that all rays of a reflection sequence share one exact mirror image.
     signs = np.sign(np.einsum("ij,ij->i", normals, normals[first][face_planes]))
     plane_normals = np.zeros((len(first), 3))
     np.add.at(plane_normals, face_planes, normals * (signs * areas)[:, None])
@@ -103,7 +103,7 @@ def merge_coplanar(
 def _unchained(
     features: NDArray[np.float64], first: NDArray[np.int64], face_planes: NDArray[np.int64], tolerance: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Part planes that hang together only in a chain, each a little off the one before; the others stay as they are."""
+    """Split planes that are linked only in a chain of small steps; the others remain as they are."""
     signs = np.sign(np.einsum("ij,ij->i", features[:, :3], features[first[face_planes], :3]))
     aligned = features * signs[:, None]
     order = np.argsort(face_planes, kind="stable")

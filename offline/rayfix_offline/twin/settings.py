@@ -18,24 +18,24 @@ class TwinSettings:
         Planes are rounded to this fraction of the tolerance before they are compared.
     surface_angle : float, rad
         Normals of a curved surface lie within this angle of the normal of the facet that it grew from. A reflected ray
-        turns by twice as much as the normal. What a surface sends to a distance D lies on an arc of at most 40 deg,
-        which one Gaussian replaces: the arc bulges by 0.06 D. A full turn takes 18 to 36 surfaces, whatever the number
-        of facets.
+        turns by twice as much as the normal, so that at a distance D the rays of a surface lie on an arc of at most
+        40 deg. One Gaussian replaces the arc, which bulges by 0.06 D. A full turn has 18 to 36 surfaces, whatever the
+        number of facets.
     facet_size : float, m
-        Flat patches larger than a square of this side, or wider than a strip of half of it, are mirrors of their own.
-        They are few and sharp: the wall beside a rounded corner must not be blurred by the corner.
+        Flat patches larger than a square of this side, or than a strip half as wide, belong to no curved surface: the
+        wall beside a rounded corner must not be blurred by the corner.
     touch : float, m
-        A point nearer than this to a surface lies on it.
+        A point closer to a surface than this lies on it.
     building_fraction : float
         A building takes up more than this fraction of the scene's bounding box.
     inner_fraction : float
         The inner faces of walls enclose more than this fraction of the volume that their outer faces enclose.
     max_parts : int
-        Largest number of parts that are looked at to find what is in a building.
+        Largest number of parts that are sampled to find what lies inside a building.
     voxel_size : float, m
         Edge of a voxel of the free space.
     max_voxels : int
-        Voxels grow rather than that the free space has more of them than this.
+        Voxels are enlarged if the free space would have more than this number.
     """
 
     weld: float = 1e-6

@@ -1,4 +1,4 @@
-"""Closed parts of the scene: solids, in which nothing can be, and enclosures, outside of which nothing can be."""
+"""Connected parts of the scene, tests whether a point is inside one, and the free space outside of solids."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -24,13 +24,13 @@ class Part:
     Attributes
     ----------
     name : str
-        Object of the scene file that it (mostly) belongs to; numbered where an object has several parts.
+        Object of the scene file that most of it belongs to; numbered if an object has several parts.
     faces : ndarray of int64, shape (n,)
-        Its triangles in the scene.
+        Indices of its triangles.
     closed : bool
-        Every edge belongs to an even number of triangles, so that it has an inside.
+        Every edge belongs to an even number of triangles, so that the part has an inside.
     consistent : bool
-        Every edge is run through once in each direction, so that all triangles face the same way.
+        Every edge is traversed once in each direction: all triangles are oriented alike.
     manifold : bool
         No edge belongs to more than two triangles.
     volume : float, m3
@@ -51,7 +51,7 @@ class Part:
 def split_parts(mesh: Mesh) -> tuple[Part, ...]:
     """Cut a mesh into connected parts, in the order of their first triangles.
 
-    What hangs together within an object and is closed is a part. The rest hangs together across objects: a room may
+    A closed component within an object is a part. All other triangles are connected across objects, because a room may
     be drawn as six sheets.
     """
     scene, topology = mesh.scene, mesh.topology
@@ -69,7 +69,7 @@ def split_parts(mesh: Mesh) -> tuple[Part, ...]:
         return np.asarray(np.bincount(label, weights=values, minlength=count), np.float64)
 
     uses, balance = topology.uses_within(label)
-    # About the part's own middle: far from the origin, the triangles' shares would cancel.
+    # About the part's own middle: far from the origin, the triangles' contributions would cancel.
     sizes = total(np.ones(len(label)))
     middle = np.stack([total(m) for m in scene.triangles.mean(axis=1).T], axis=1) / sizes[:, None]
     a, b, c = (scene.triangles[:, i] - middle[label] for i in range(3))
@@ -98,7 +98,7 @@ def split_parts(mesh: Mesh) -> tuple[Part, ...]:
 
 
 def _names(scene: Scene, label: NDArray[np.int64], count: int) -> list[str]:
-    """Names of parts: the object that most of their triangles belong to, numbered where it has several."""
+    """Names of parts: the object of most of their triangles, numbered if it has several parts."""
     pairs, uses = np.unique(label * len(scene.objects) + scene.face_objects, return_counts=True)
     part, named = pairs // len(scene.objects), pairs % len(scene.objects)
     order = np.lexsort((-uses, part))
@@ -114,9 +114,9 @@ def _names(scene: Scene, label: NDArray[np.int64], count: int) -> list[str]:
 
 
 def is_inside(triangles: NDArray[np.float64], point: NDArray[np.float64]) -> bool:
-    """Whether a point lies inside a closed surface, however its triangles face.
+    """Whether a point lies inside a closed surface, whatever the orientation of its triangles.
 
-    Counts the crossings of three rays in directions that no building has, and takes the majority.
+    The majority of three rays decides, by the parity of their crossings; no building has edges in their directions.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def is_inside(triangles: NDArray[np.float64], point: NDArray[np.float64]) -> boo
 
 
 def touched(triangles: NDArray[np.float64], point: NDArray[np.float64], *, touch: float = TwinSettings.touch) -> int:
-    """Triangle that a point lies on, on neither side of it.
+    """Triangle that a point lies on.
 
     Parameters
     ----------
@@ -174,14 +174,14 @@ def map_free_space(
     voxel_size: float,
     max_voxels: int = TwinSettings.max_voxels,
 ) -> FreeSpace:
-    """Mark the voxels whose centres lie outside all solids and, where there are rooms, inside one.
+    """Mark the voxels whose centres lie outside all solids and, if there are rooms, inside one.
 
     Parameters
     ----------
     solids, rooms : sequence of Part
         Closed parts.
     voxel_size : float, m
-        Grows when the scene would take more than ``max_voxels``.
+        Larger if the scene would take more than ``max_voxels``.
     max_voxels : int
     """
     low, high = scene.bounds
@@ -207,12 +207,12 @@ def map_free_space(
 
 
 def sealed_space(free_space: FreeSpace, stations: NDArray[np.float64]) -> FreeSpace | None:
-    """Cut the free space down to what the stations reach, where solids, such as walls, seal that off.
+    """Restrict the free space to what is connected with the stations, if solids such as walls enclose it.
 
     Returns
     -------
     FreeSpace or None
-        None where a way leads from a station to the border of the scene.
+        None if free space connects a station with the border of the scene.
     """
     index = np.floor((stations - free_space.origin) / free_space.voxel_size).astype(np.int64)
     held = np.all((index >= 0) & (index < free_space.free.shape), axis=1)
@@ -233,9 +233,9 @@ def _flip_above(
     voxel: Any,
     parity: Any,
 ) -> None:
-    """Flip the voxels whose centres lie above each triangle: at the end those inside are set."""
+    """Flip the voxels whose centres lie above each triangle, so that those inside the part end up set."""
     nx, ny, nz = parity.shape
-    # Columns a hair off the voxels' centres, so that they meet no edge of a drawing on round coordinates.
+    # Columns slightly beside the voxels' centres, so that they hit no edge of a drawing on round coordinates.
     shift_x, shift_y = 0.5 + 1.37e-5, 0.5 + 2.71e-5
     for t in range(len(triangles)):
         ax, ay, az = triangles[t, 0]

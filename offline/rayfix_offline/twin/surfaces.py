@@ -1,8 +1,8 @@
-"""Facets of a curved surface: each mirrors by its own plane, but together they are one surface.
+"""Curved surfaces: facets with mirror planes of their own that count as one surface.
 
 A pillar of 256 facets has 256 mirror images of a station, and each would be a group of its own in every cell that sees
-the pillar. Rays that run over the same surfaces in the same order are therefore gathered together, whichever facets
-they meet. How they run is still computed facet by facet.
+the pillar. Rays that are reflected by the same surfaces in the same order are therefore gathered in one group,
+whichever facets they hit. The reflections themselves are computed facet by facet.
 """
 
 from typing import Any
@@ -26,8 +26,8 @@ def join_facets(
 ) -> Planes:
     """Find the curved surfaces of a mesh.
 
-    Small facets that share an edge make up a surface, as far as their normals stay within ``surface_angle`` of the
-    first one's.
+    Small facets that share an edge form a surface as long as their normals stay within ``surface_angle`` of that of the
+    first facet.
 
     Parameters
     ----------
@@ -41,8 +41,8 @@ def join_facets(
     Returns
     -------
     Planes
-        With facets of different surfaces apart, even where they happen to be coplanar; the very same ``planes`` where
-        nothing is curved.
+        Facets of different surfaces have different planes, even if they are coplanar. The same object as ``planes``
+        where nothing is curved.
     """
     triangles = mesh.scene.triangles
     first, second = mesh.topology.neighbours()
@@ -68,14 +68,14 @@ def _crosses(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
 def _patch_sizes(
     triangles: NDArray[np.float64], links: NDArray[np.int64], inner_sides: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Four times area by circumference of the flat patch that each triangle belongs to, shape (n_faces,), m."""
+    """Size of the flat patch of each triangle, 4 area / circumference, shape (n_faces,), m."""
     patch = connect(links, len(triangles))
     sides = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
     outer = sides.reshape(-1).copy()
     outer[inner_sides] = 0.0
     around = np.bincount(patch, weights=outer.reshape(sides.shape).sum(axis=1))
     area = np.bincount(patch, weights=0.5 * np.linalg.norm(_crosses(triangles), axis=1))
-    # A patch that closes upon itself has no circumference; tolerances can make one.
+    # Tolerances can produce a closed patch, which has no circumference.
     size = np.divide(4.0 * area, around, out=np.full(len(area), np.inf), where=around > 0.0)
     return np.asarray(size[patch])
 
@@ -83,9 +83,9 @@ def _patch_sizes(
 def _fold_cosines(
     triangles: NDArray[np.float64], first: NDArray[np.int64], second: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Cosine of the angle by which neighbours fold: 1 where the surface goes on flat, -1 where it turns back.
+    """Cosine of the fold angle between neighbours: 1 for a flat surface, -1 where it turns back.
 
-    It does not depend on the way that the triangles face.
+    It does not depend on the orientation of the triangles.
     """
     inward = []
     for side in (first, second):
@@ -101,7 +101,7 @@ def _fold_cosines(
 
 @numba.njit(cache=True, nogil=True)
 def _grow(offsets: Any, neighbours: Any, normals: Any, cosine: Any) -> Any:
-    """Grow surfaces over smooth edges, from one triangle after the other; -1 where a triangle has none."""
+    """Grow surfaces across smooth edges, from one seed triangle after another; -1 for a triangle without one."""
     count = len(offsets) - 1
     surface = np.full(count, -1, np.int64)
     oriented = normals.copy()
@@ -138,9 +138,9 @@ def _grow(offsets: Any, neighbours: Any, normals: Any, cosine: Any) -> Any:
 
 
 def _split(planes: Planes, surface: NDArray[np.int64]) -> Planes:
-    """Give the facets of each surface mirrors of their own, and the mirrors their surface."""
+    """Give the facets of each surface planes of their own, and the planes their surface."""
     plane = planes.face_planes.astype(np.int64)
-    # A surface on one plane only is not curved.
+    # A surface with a single plane is not curved.
     pairs = np.unique(np.stack([surface, plane], axis=1), axis=0)
     curved = np.bincount(pairs[:, 0] + 1)[1:] > 1
     if not curved.any():
@@ -148,7 +148,7 @@ def _split(planes: Planes, surface: NDArray[np.int64]) -> Planes:
     surface = np.where(surface >= 0, np.where(curved[surface], surface, -1), -1)
     keys, face_planes = np.unique(plane * (len(curved) + 1) + surface + 1, return_inverse=True)
     old_plane, of_surface = keys // (len(curved) + 1), keys % (len(curved) + 1) - 1
-    # Flat mirrors are surfaces by themselves.
+    # Each flat plane is a surface of its own.
     named = np.where(of_surface >= 0, len(planes) + of_surface, old_plane)
     return Planes(
         normals=planes.normals[old_plane],

@@ -1,4 +1,4 @@
-"""How the triangles of a scene hang together: which corners are one point and which sides one edge."""
+"""Connectivity of triangles: welded points, shared edges, connected components."""
 
 from dataclasses import dataclass
 
@@ -27,12 +27,12 @@ class Topology:
     edges: NDArray[np.int64]
 
     def neighbours(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Sides that two triangles, and no third, have in common.
+        """Edges that exactly two triangles share, as pairs of their sides.
 
         Returns
         -------
         first, second : ndarray of int64, shape (n_pairs,)
-            Sides of the one and of the other triangle: triangle k // 3, its side k % 3.
+            Side k is side ``k % 3`` of triangle ``k // 3``.
         """
         sides = self.edges.reshape(-1)
         order = np.argsort(sides, kind="stable")
@@ -40,13 +40,13 @@ class Topology:
         return paired[0::2], paired[1::2]
 
     def components(self, groups: NDArray[np.integer], *, among: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-        """Label the connected parts of triangles; they hang together at points, within their group.
+        """Label connected components; triangles of the same group that share a point are connected.
 
         Parameters
         ----------
         groups : ndarray of int, shape (n_faces,)
         among : ndarray of int, optional
-            Triangles to look at; all when left out.
+            Indices of the triangles to label; all by default.
 
         Returns
         -------
@@ -100,7 +100,7 @@ class Topology:
         return np.asarray(np.where(drawn == mirrored, False, turned ^ most[name]))
 
     def uses_within(self, groups: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Count how triangles of a group use the edges.
+        """Count the triangles of the same group at each edge.
 
         Parameters
         ----------
@@ -109,9 +109,10 @@ class Topology:
         Returns
         -------
         uses : ndarray of int64, shape (n_faces, 3)
-            Triangles of the same group that have the side's edge, the triangle itself included.
+            Triangles of the group at the side's edge, the triangle itself included.
         balance : ndarray of int64, shape (n_faces, 3)
-            How many more of them run through the edge one way than the other; 0 where they face the same way.
+            Difference between the numbers of those that traverse the edge in one direction and in the other; 0 where
+            they are oriented consistently.
         """
         keys = self.edges * (int(groups.max()) + 1) + np.asarray(groups, np.int64)[:, None]
         _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
@@ -140,9 +141,9 @@ def connect(links: NDArray[np.int64], count: int) -> NDArray[np.int64]:
 
 
 def number_rows(rows: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Give rows numbers in lexicographic order, equal ones the same, as ``np.unique`` does with ``axis=0``.
+    """Rank rows in lexicographic order; equal rows have the same rank, as with ``np.unique(axis=0)``.
 
-    It goes column by column, for sorting numbers takes a fraction of the time of sorting rows.
+    It works column by column, because sorting numbers is much faster than sorting rows.
 
     Parameters
     ----------
@@ -154,8 +155,8 @@ def number_rows(rows: NDArray[np.float64]) -> NDArray[np.int64]:
     """
     number = np.zeros(len(rows), np.int64)
     for column in rows.T:
-        _, place = np.unique(column, return_inverse=True)
-        _, number = np.unique(number * (int(place.max(initial=0)) + 1) + place.reshape(-1), return_inverse=True)
+        _, rank = np.unique(column, return_inverse=True)
+        _, number = np.unique(number * (int(rank.max(initial=0)) + 1) + rank.reshape(-1), return_inverse=True)
         number = number.reshape(-1)
     return number
 

@@ -1,4 +1,4 @@
-"""The digital twin, ready for rays: scene, mirror planes, ray engine and free space, checked against the site."""
+"""The digital twin: scene, mirror planes, ray engine and free space, checked against the site."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 from rayfix_offline.scene.engine import EmbreeEngine, RayEngine
 from rayfix_offline.scene.scene import Scene, load_scene
 from rayfix_offline.site import SiteFile
-from rayfix_offline.twin.cleaning import find_repeats
+from rayfix_offline.twin.cleaning import find_duplicates
 from rayfix_offline.twin.enclosures import find_enclosures
 from rayfix_offline.twin.findings import (
     Finding,
@@ -30,7 +30,7 @@ from rayfix_tables.freespace import FreeSpace
 
 @dataclass(frozen=True, kw_only=True)
 class Twin:
-    """A scene that rays can be launched in."""
+    """A scene prepared for ray launching."""
 
     scene: Scene
     planes: Planes
@@ -52,18 +52,18 @@ def prepare_twin(site: SiteFile, folder: Path, settings: TwinSettings | None = N
     Raises
     ------
     SceneError
-        When the scene cannot be read. What is wrong with a readable scene is in the twin's findings.
+        When the scene cannot be read. Problems of a readable scene are in the twin's findings.
     """
     scene = load_scene(folder / site.site.scene, unit=site.site.scene_unit, up=site.site.scene_up)
     return prepare_scene(site, scene, settings)
 
 
 def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = None) -> Twin:
-    """Check a scene that is loaded already; see :func:`prepare_twin`."""
+    """Prepare the twin of a scene that is already loaded; see :func:`prepare_twin`."""
     settings = settings or TwinSettings()
     mesh = Mesh(scene=scene, weld=settings.weld)
-    repeats = find_repeats(mesh)
-    mesh = mesh.without(repeats.needless)
+    duplicates = find_duplicates(mesh)
+    mesh = mesh.without(duplicates.redundant)
     scene, parts = mesh.scene, split_parts(mesh)
     stations = np.array([station.position_m for station in site.stations])
     enclosures = find_enclosures(scene, parts, stations, settings)
@@ -81,7 +81,7 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
     findings = [
         *size_findings(site, scene),
         *file_findings(scene),
-        *mesh_findings(scene, repeats, parts, enclosures),
+        *mesh_findings(scene, duplicates, parts, enclosures),
         *material_findings(site, scene),
         *station_findings(site, scene, parts, enclosures, touch=settings.touch),
     ]
@@ -100,12 +100,12 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
 
 
 def refuse_errors(twin: Twin) -> None:
-    """Raise what stops a build, all of it at once.
+    """Raise one exception for all findings that stop a build.
 
     Raises
     ------
     SceneError
-        When the twin has findings that are errors.
+        When the twin has findings of severity "error".
     """
     errors = [finding.message for finding in twin.findings if finding.severity == "error"]
     if errors:

@@ -1,1 +1,1 @@
-"""Compiled operations on Gaussians that building and locating share."""
+"""Operations on Gaussians that the offline job and the service have in common."""

@@ -1,4 +1,4 @@
-"""Components of cells, conditioned on a measured angle; the compiled kernel of fusion and balance."""
+"""Components of cells conditioned on a measured angle; used by the fusion and by the normalisation."""
 
 from typing import Any
 
@@ -49,7 +49,7 @@ def condition_on_angle(
     cov = np.empty((3, 3))
     cross = np.empty((3, 3))
     slope = np.empty((3, 3))
-    place = 0
+    row = 0
     for c in range(len(begins)):
         for k in range(begins[c], ends[c]):
             p00, p01, p02 = np.float64(u_cov[k, 0]), np.float64(u_cov[k, 1]), np.float64(u_cov[k, 2])
@@ -61,7 +61,7 @@ def condition_on_angle(
             r2 = rest_mean[c, 1] - u_mean[k, 2]
             g1 = i11 * r1 + i12 * r2
             g2 = i12 * r1 + i22 * r2
-            out_log[place] = log_factor[c] + log_weight[k] - 0.5 * (r1 * g1 + r2 * g2 + np.log(det)) - LOG_2PI
+            out_log[row] = log_factor[c] + log_weight[k] - 0.5 * (r1 * g1 + r2 * g2 + np.log(det)) - LOG_2PI
             column1 = (p01, p11, p12)
             column2 = (p02, p12, p22)
             prior = ((p00, p01, p02), (p01, p11, p12), (p02, p12, p22))
@@ -71,7 +71,7 @@ def condition_on_angle(
                 k2 = column1[i] * i12 + column2[i] * i22
                 for j in range(3):
                     cov[i, j] = prior[i][j] - k1 * column1[j] - k2 * column2[j]
-            # The tube widens: around the new mean it points elsewhere, and its slopes are those of another length.
+            # The tube widens: at the new mean its direction differs, and its slopes are those of another length.
             length = np.float64(u_mean[k, 0])
             stretch = 1.0 + u[0] / length
             for i in range(3):
@@ -83,10 +83,10 @@ def condition_on_angle(
                     along += widening * u[a]
                     slope[i, a] = jacobian[k, i, a] * stretch
                 slope[i, 0] = along
-                out_mean[place, i] = moved + jacobian[k, i, 0] * u[0]
+                out_mean[row, i] = moved + jacobian[k, i, 0] * u[0]
                 for j in range(3):
                     cross[i, j] = along * cov[0, j] + slope[i, 1] * cov[1, j] + slope[i, 2] * cov[2, j]
-            out_mean[place, 3] = u_mean[k, 0] + u[0]
+            out_mean[row, 3] = u_mean[k, 0] + u[0]
             packed = 0
             for i in range(3):
                 for j in range(i, 3):
@@ -98,9 +98,9 @@ def condition_on_angle(
                         for b in range(1, 3):
                             products = cov[0, 0] * cov[a, b] + cov[0, a] * cov[0, b]
                             total += products * jacobian[k, i, a] * jacobian[k, j, b] / (length * length)
-                    out_cov[place, i, j] = total
-                    out_cov[place, j, i] = total
-                out_cov[place, i, 3] = cross[i, 0]
-                out_cov[place, 3, i] = cross[i, 0]
-            out_cov[place, 3, 3] = cov[0, 0]
-            place += 1
+                    out_cov[row, i, j] = total
+                    out_cov[row, j, i] = total
+                out_cov[row, i, 3] = cross[i, 0]
+                out_cov[row, 3, i] = cross[i, 0]
+            out_cov[row, 3, 3] = cov[0, 0]
+            row += 1

@@ -1,4 +1,4 @@
-"""Points that stand for a standard normal: a few of exact moments, and any number that fill it evenly."""
+"""Points that represent a standard normal: a set with exact moments, and a uniform sequence of any length."""
 
 from functools import cache
 from statistics import NormalDist
@@ -12,7 +12,7 @@ SQUARES = (2.0, 3.0, 7.0)
 
 @cache
 def unit_points(count: int = 128) -> NDArray[np.float64]:
-    """Points that stand for a standard normal in three dimensions, shape (count, 3): mean 0, covariance 1 exactly."""
+    """Points of a standard normal in three dimensions, shape (count, 3), with exactly mean 0 and covariance 1."""
     # An additive recurrence in three dimensions on the generalised golden ratio, mapped to the sphere and the radius.
     ratio = 1.2207440846057596
     index = np.arange(1, count // 2 + 1)
@@ -31,11 +31,12 @@ def unit_points(count: int = 128) -> NDArray[np.float64]:
 
 @cache
 def normal_points(count: int) -> NDArray[np.float64]:
-    """Points that fill a standard normal in three dimensions evenly, and so does any run of them; shape (count, 3).
+    """Quasi-random points of a standard normal in three dimensions, shape (count, 3); so is any run of them.
 
-    Multiples of irrational numbers, which fill the unit cube more evenly than chance (R. D. Richtmyer, "The evaluation
-    of definite integrals, and a quasi-Monte-Carlo method based on the properties of algebraic numbers", 1951), and the
-    normal's quantiles of them. Of 1,024 points the radius of the sphere that holds 50 to 99 % is right to 0.5 %.
+    Quantiles of multiples of irrational numbers, which fill the unit cube more uniformly than random numbers
+    (R. D. Richtmyer, "The evaluation of definite integrals, and a quasi-Monte-Carlo method based on the properties of
+    algebraic numbers", 1951).
+    With 1,024 points the radius of the sphere that contains 50 to 99 % of them is exact to 0.5 %.
     """
     uniform = (0.5 + np.arange(1, count + 1)[:, None] * np.sqrt(SQUARES)) % 1.0
     quantile = NormalDist().inv_cdf

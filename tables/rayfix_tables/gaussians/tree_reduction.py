@@ -1,14 +1,14 @@
-"""Fewer components, thousands at a time: halve the space they lie in and merge the halves where little is lost.
+"""Mixture reduction by a tree, for thousands of components.
 
-A tree over the components is made by halving the box of their means along its longest side, again and again. From the
-leaves up, the two halves of a node become one component where that raises the divergence by no more than is allowed
-(the bound is that of A. R. Runnalls, "Kullback-Leibler approach to Gaussian mixture reduction", IEEE Trans. Aerosp.
+The tree is made by halving the bounding box of the means along its longest side, again and again. From the leaves up,
+the two halves of a node are merged into one component if that raises the divergence by no more than a limit (the bound
+of A. R. Runnalls, "Kullback-Leibler approach to Gaussian mixture reduction", IEEE Trans. Aerosp.
 Electron. Syst. 43 (3), 2007: ``((w_i + w_j) log|P_ij| - w_i log|P_i| - w_j log|P_j|) / 2`` for components i and j and
-their union's covariance P_ij). Each component meets only its like, so the time grows with the number of components and
+their union's covariance P_ij). Only neighbours are compared, so that the time grows with the number of components and
 not with that of their pairs.
 
-What no measurement tells apart need not be kept apart: the divergence may be that of the mixture *as it is measured*,
-with noise added before determinants are taken.
+The divergence may be that of the mixture *as it is measured*: noise is added before determinants are computed, so that
+components are merged which no measurement distinguishes.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ import numba
 import numpy as np
 
 SMALLEST_PIVOT = 1e-30
-"""A covariance that rounding has made singular counts as this thin."""
+"""Smallest pivot of an elimination, for covariances that rounding has made singular."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -33,17 +33,16 @@ def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, no
     group : ndarray of int64, shape (n,)
         Components of different groups are not merged.
     scale : tuple of d floats, or ndarray of shape (d,)
-        Lengths in the units of which the sides of a box are compared. With a tuple, d is known when this is compiled,
-        which makes it twice as fast.
+        Units in which the sides of a box are compared. With a tuple, d is known at compile time: it is twice as fast.
     noise : tuple of d floats, or ndarray of shape (d,)
         Variances of the noise that measurements add.
     max_divergence : float
-        What a merge may cost, nats.
+        Largest divergence of a merge, nats.
 
     Returns
     -------
     ndarray of int64, shape (n,)
-        Component that each one has become part of; its own number where it is left.
+        Component that each one was merged into; its own index if it remains.
     """
     count, dimension = len(mean), len(scale)
     order, left, right, size = _tree(mean, group, scale)
@@ -52,7 +51,7 @@ def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, no
     into = np.arange(count)
     for i in range(count):
         log_det[i] = _noisy_log_det(cov[i], noise, work)
-    whole = np.full(size, -1, np.int64)  # the one component that a node has become
+    whole = np.full(size, -1, np.int64)  # the component that a node was merged into
     union = np.empty((dimension, dimension))
     for node in range(size - 1, -1, -1):
         if left[node] < 0:
@@ -62,16 +61,18 @@ def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, no
         if i < 0 or j < 0 or group[i] != group[j]:
             continue
         total = weight[i] + weight[j]
-        share = weight[i] / total if total > 0.0 else 0.5
+        fraction = weight[i] / total if total > 0.0 else 0.5
         for a in range(dimension):
-            apart = share * (1.0 - share) * (mean[i, a] - mean[j, a])
+            offset = fraction * (1.0 - fraction) * (mean[i, a] - mean[j, a])
             for b in range(a + 1):
-                union[a, b] = cov[j, a, b] + share * (cov[i, a, b] - cov[j, a, b]) + apart * (mean[i, b] - mean[j, b])
+                union[a, b] = (
+                    cov[j, a, b] + fraction * (cov[i, a, b] - cov[j, a, b]) + offset * (mean[i, b] - mean[j, b])
+                )
         united = _noisy_log_det(union, noise, work)
         if 0.5 * (total * united - weight[i] * log_det[i] - weight[j] * log_det[j]) > max_divergence:
             continue
         for a in range(dimension):
-            mean[i, a] = mean[j, a] + share * (mean[i, a] - mean[j, a])
+            mean[i, a] = mean[j, a] + fraction * (mean[i, a] - mean[j, a])
             for b in range(a + 1):
                 cov[i, a, b] = union[a, b]
                 cov[i, b, a] = union[a, b]
@@ -87,13 +88,13 @@ def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, no
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _tree(mean: Any, group: Any, scale: Any) -> Any:
-    """Halve groups and then their boxes until each holds one component.
+    """Halve groups and then their boxes until each contains one component.
 
     Returns
     -------
     order : ndarray of int64, shape (n,)
     left, right : ndarray of int64, shape (2 n - 1,)
-        Children of each node, which come after it; of a leaf -1 and its place in ``order``.
+        Children of each node, which follow it; for a leaf -1 and its index in ``order``.
     size : int
         Number of nodes.
     """
@@ -114,7 +115,7 @@ def _tree(mean: Any, group: Any, scale: Any) -> Any:
             node += 1
             continue
         least = greatest = group[order[begin]]
-        if mixed[node]:  # what a box of one group is cut into is, too
+        if mixed[node]:  # the halves of a box of one group have one group
             for n in range(begin, end):
                 least, greatest = min(least, group[order[n]]), max(greatest, group[order[n]])
         mixed[node] = greatest > least
@@ -132,7 +133,7 @@ def _tree(mean: Any, group: Any, scale: Any) -> Any:
                 if (high[a] - low[a]) / scale[a] > longest:
                     longest, axis = (high[a] - low[a]) / scale[a], a
             i = _partition(order, begin, end, mean[:, axis], 0.5 * (low[axis] + high[axis]))
-        if i in (begin, end):  # all in one place
+        if i in (begin, end):  # all means are equal
             i = (begin + end) // 2
         left[node], right[node] = size, size + 1
         first[size], stop[size], mixed[size] = begin, i, mixed[node]
@@ -144,7 +145,7 @@ def _tree(mean: Any, group: Any, scale: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _partition(order: Any, begin: Any, end: Any, value: Any, limit: Any) -> Any:
-    """Bring the components of a part of ``order`` whose value is below a limit to its front; returns where they end."""
+    """Move the components of a part of ``order`` with values below a limit to its front; return where they end."""
     i, j = begin, end - 1
     while i <= j:
         component = order[i]

@@ -25,12 +25,12 @@ def unpack_upper(packed: Any, n: Any, matrix: Any, first: Any) -> None:
         Filled from its row and column ``first`` on; a slice for each matrix would take longer than all else.
     first : int
     """
-    place = 0
+    entry = 0
     for i in range(3):
         for j in range(i, 3):
-            matrix[first + i, first + j] = packed[n, place]
-            matrix[first + j, first + i] = packed[n, place]
-            place += 1
+            matrix[first + i, first + j] = packed[n, entry]
+            matrix[first + j, first + i] = packed[n, entry]
+            entry += 1
 
 
 @numba.njit(cache=True, nogil=True)

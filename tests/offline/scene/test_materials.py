@@ -192,7 +192,7 @@ def test_no_materials_at_all() -> None:
 
 def test_vacuum_leaves_a_little() -> None:
     reflectivity = itu_reflectivity(np.zeros(1, np.int16), ("itu_vacuum",), carrier_ghz=3.5, loss_db=6.0)
-    assert reflectivity.log_gain(np.zeros(1, np.int32), np.array([0.7])) == np.log10(ReflectionSettings.least_power)
+    assert reflectivity.log_gain(np.zeros(1, np.int32), np.array([0.7])) == np.log10(ReflectionSettings.min_power)
 
 
 # Launched rays

@@ -231,7 +231,7 @@ def test_degenerate_triangles(tmp_path: Path, write_site: WriteSite, cluttered_s
         cabinet.vertices, [*cabinet.faces, (0, 0, 1), (2, 2, 2)], process=False
     )
     twin = twin_of(write_site(tmp_path, scene=cluttered_scene, stations=stations(*FREE)))
-    assert messages(twin, "warning") == ["2 triangles have no area and are left out; clean the mesh"]
+    assert messages(twin, "warning") == ["2 triangles have no area and are removed; clean the mesh"]
 
 
 def test_no_free_space(tmp_path: Path, write_site: WriteSite) -> None:
