@@ -127,15 +127,16 @@ def test_every_command_refuses_a_table_that_is_read_for_ever(
 def test_a_build_over_a_damaged_table_goes_on_and_says_so(
     table_path: Path, tmp_path: Path, hall_site_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from rayfix_offline.job.method import Method
     from rayfix_offline.job.previous_table import read_former
 
     table_path.write_bytes(hanging(table_path))
     monkeypatch.setattr(checked, "_DEFAULT_LIMITS", SHORT)
     said: list[str] = []
-    assert read_former(table_path, required=False, refused=said.append) is None
+    assert read_former(table_path, Method(), required=False, refused=said.append) is None
     (line,) = said
     assert line.startswith(f"nothing is taken over from the table that was there: {table_path} is damaged: ")
-    assert read_former(tmp_path / "none.h5", required=False, refused=said.append) is None
+    assert read_former(tmp_path / "none.h5", Method(), required=False, refused=said.append) is None
     assert len(said) == 1
 
 

@@ -14,7 +14,13 @@ from rayfix_tables.gaussians import kernel_cache
 from rayfix_tables.gaussians.kernel_cache import ensure_kernel_cache
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("rayfix", "offline/rayfix_offline", "service/rayfix_service", "tables/rayfix_tables")
+PACKAGES = (
+    "rayfix",
+    "evaluation/rayfix_evaluation",
+    "offline/rayfix_offline",
+    "service/rayfix_service",
+    "tables/rayfix_tables",
+)
 
 IMPORT_ALL_KERNELS = """
 import rayfix_service.fusion.locator, rayfix_offline.build, rayfix_evaluation.truth.forward

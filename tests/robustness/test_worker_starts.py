@@ -23,7 +23,7 @@ from tests.support.server_process import start_server
 RUN = """\
     import os, sys, time
     from pathlib import Path
-    from rayfix_service.http import workers
+    from rayfix_service.server import workers
 
     workers._LOOK_SECONDS = 0.02
     broken = Path(sys.argv[1])

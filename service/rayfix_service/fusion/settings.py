@@ -55,7 +55,7 @@ class FusionSettings:
     beam_width: Annotated[int, Limits(least=1, most=1_000_000)] = 2048
     most_alternatives: Annotated[int, Limits(least=1)] = 8192
     most_considered: Annotated[int, Limits(least=1)] = 2**23
-    considered_tables: Annotated[int, Limits(least=1)] = 64
+    considered_tables: Annotated[int, Limits(least=0)] = 64
     most_products: Annotated[int, Limits(least=1)] = 2**28
     max_divergence: Annotated[float, Limits(least=0.0)] = 5e-3
     component_floor: Probability = 1e-6

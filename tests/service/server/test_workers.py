@@ -29,7 +29,7 @@ from tests.support.server_process import start_server
 
 RUN = """\
     import os, sys, time
-    from rayfix_service.http import workers
+    from rayfix_service.server import workers
 
     workers._LOOK_SECONDS, workers._SILENT_LOOKS = 0.02, 25
 
@@ -42,7 +42,7 @@ RUN = """\
     """
 SERVE = """\
     import sys
-    from rayfix_service.http import table_checks
+    from rayfix_service.http.answering import table_checks
     from rayfix_service.server.server import serve
 
     check_file = table_checks.check_file

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.posterior.credible import _squared_distances
 from rayfix_service.fusion.posterior.cut_by_walls import cut_to_free_space
-from rayfix_service.fusion.posterior.modes import find_hills
+from rayfix_service.fusion.posterior.modes import find_modes
 from rayfix_service.fusion.posterior.points import draw_points
 from rayfix_service.fusion.posterior.posterior import free_shares
 from rayfix_service.fusion.posterior.voxels import nearest_free
@@ -44,8 +44,8 @@ def test_it_loses_its_weight_when_it_is_cut(mixture: tuple[Array, Array, Array])
 
 
 def test_it_is_in_no_hill(mixture: tuple[Array, Array, Array]) -> None:
-    probability, position, moment, member = find_hills(*mixture, *SPACE)
-    its_probability, its_position, its_moment, its_member = find_hills(*without_the_second(mixture), *SPACE)
+    probability, position, moment, member = find_modes(*mixture, *SPACE)
+    its_probability, its_position, its_moment, its_member = find_modes(*without_the_second(mixture), *SPACE)
     np.testing.assert_array_equal(probability, its_probability)
     np.testing.assert_array_equal(position, its_position)
     np.testing.assert_array_equal(moment, its_moment)

@@ -191,7 +191,7 @@ def test_limits_are_inclusive(hall_table_path: Path):
 def test_a_defect_says_nothing_of_its_cause(
     hall_app: RunningApp, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
-    def fail(self: Locator, report: object) -> None:
+    def fail(self: Locator, report: object, **options: object) -> None:
         raise RuntimeError("secret of /etc/secret")
 
     with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):

@@ -176,7 +176,7 @@ def test_an_id_that_is_unfit_for_a_log_is_replaced(service: RunningApp, unfit: A
 
 @pytest.mark.parametrize("query", ["", "?output=native"])  # past the router, and by it
 def test_a_defect_is_logged_with_its_request(service: RunningApp, monkeypatch: pytest.MonkeyPatch, query: str):
-    def fail(self: Locator, report: Any) -> Any:
+    def fail(self: Locator, report: Any, **options: Any) -> Any:
         raise RuntimeError("a defect")
 
     counted = ("rayfix_http_requests_total", "POST", "/v1/positions", "500")
