@@ -242,8 +242,8 @@ def test_eight_times_as_much_takes_at_most_twelve_times_as_long(case: Callable[[
     """The time for u-blox lines grew with the square and cube of their number, that for other messages with errors."""
     small, large = case(size), case(8 * size)
     for runs in (3, 5, 9, 15):
-        # What takes a quarter of a millisecond takes no time that could be compared.
-        if seconds(large, runs) <= 12.0 * max(seconds(small, runs), 2.5e-4):
+        # What takes less than a millisecond takes no time that could be compared on a busy machine.
+        if seconds(large, runs) <= 12.0 * max(seconds(small, runs), 1e-3):
             return
     pytest.fail(f"{seconds(small, 9):.2e} s became {seconds(large, 9):.2e} s")
 

@@ -109,6 +109,7 @@ class Locator:
         for station in self.table.site.stations:
             length = Range(station_id=station.id, path_length=5.0, stdev=0.5)
             self.locate(Report(measurements=(length,)))
+            self.seconds(Report(measurements=(length,)))
             for stdev in (0.5 * window, window):  # looked up in one cell and in several
                 angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=stdev, zenith_stdev=stdev)
                 self.locate(Report(measurements=(angle, length)))

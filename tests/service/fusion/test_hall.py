@@ -192,7 +192,7 @@ def test_a_wider_beam_without_merging_gives_the_same_fix(hall: Hall, timing: Tim
     A shoulder of a mode may just be a mode by itself or just be none; mostly the modes are the same.
     """
     wide = Locator(hall.table, FusionSettings(beam_width=8192, max_divergence=0.0))
-    same_hills = 0
+    same_modes = 0
     for n in range(0, 100, 12):
         report = hall.report(n, timing)
         fix, expected = hall.locator.locate(report), wide.locate(report)
@@ -206,11 +206,11 @@ def test_a_wider_beam_without_merging_gives_the_same_fix(hall: Hall, timing: Tim
         assert lost.mean() < 0.05  # nats
         modes = [sum(candidate.probability > 0.03 for candidate in one.candidates) for one in (fix, expected)]
         if modes[0] == modes[1]:
-            same_hills += 1
+            same_modes += 1
             assert fix.status == expected.status
             assert best(fix).probability == pytest.approx(best(expected).probability, abs=0.04)
             assert np.linalg.norm(best(fix).position - best(expected).position) < 0.01  # m
-    assert same_hills >= 6  # of nine
+    assert same_modes >= 6  # of nine
 
 
 def test_however_many_times_a_path_has_they_may_be_outliers(hall: Hall) -> None:

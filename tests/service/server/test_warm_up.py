@@ -12,7 +12,7 @@ from rayfix_service.fusion.locator import Locator
 from rayfix_service.wire import parse_report
 from rayfix_tables.table import Table
 
-names = [m.name for m in pkgutil.iter_modules(rayfix_service.fusion.__path__, "rayfix_service.fusion.")]
+names = [m.name for m in pkgutil.walk_packages(rayfix_service.fusion.__path__, "rayfix_service.fusion.")]
 modules = [rayfix_tables.gaussians.tree_reduction, *(importlib.import_module(name) for name in names)]
 
 def compiled():

@@ -137,14 +137,14 @@ def test_the_upright_ellipsoid_has_a_vertical_axis() -> None:
 # --- modes, walls, outliers ------------------------------------------------------------------------------
 
 
-def two_hills() -> tuple[Array, Array, Array]:
+def two_modes() -> tuple[Array, Array, Array]:
     """Two Gaussians 6 m apart, of 0.7 and 0.3; a log evidence of about -5."""
     mean = np.array([[0.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
     return np.log([0.7, 0.3]) - 5.0, mean, np.stack([0.04 * np.eye(3), 0.09 * np.eye(3)])
 
 
 def test_a_region_reaches_to_a_rival_where_its_probability_needs_that() -> None:
-    log_weight, mean, cov = two_hills()
+    log_weight, mean, cov = two_modes()
     regions = regions_of(log_weight, mean, cov)
     half, most = regions.ellipsoid(0.5), regions.ellipsoid(0.9)
     assert not half.holds(mean[1])
@@ -171,7 +171,7 @@ def test_regions_hold_their_share_of_the_posterior(probability: float) -> None:
         0.05 * root @ root.transpose(0, 2, 1) + 0.02 * np.eye(3),
     )
     # Of forty cut Gaussians each has so few points that they are as good as drawn.
-    for (log_weight, mean, cov), space, tolerance in ((two_hills(), OPEN, 0.02), (many, solid, 0.035)):
+    for (log_weight, mean, cov), space, tolerance in ((two_modes(), OPEN, 0.02), (many, solid, 0.035)):
         hypotheses = Hypotheses(
             log_weight=log_weight,
             mean=mean,

@@ -10,6 +10,7 @@ from rayfix_service.fusion.posterior.modes import find_modes
 from rayfix_service.fusion.posterior.points import draw_points
 from rayfix_service.fusion.posterior.posterior import free_shares
 from rayfix_service.fusion.posterior.voxels import nearest_free
+from rayfix_service.fusion.stopping import NEVER
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.normal_points import normal_points, unit_points
 
@@ -43,9 +44,9 @@ def test_it_loses_its_weight_when_it_is_cut(mixture: tuple[Array, Array, Array])
         np.testing.assert_array_equal(found[[0, 2]], others)
 
 
-def test_it_is_in_no_hill(mixture: tuple[Array, Array, Array]) -> None:
-    probability, position, moment, member = find_modes(*mixture, *SPACE)
-    its_probability, its_position, its_moment, its_member = find_modes(*without_the_second(mixture), *SPACE)
+def test_it_is_in_no_mode(mixture: tuple[Array, Array, Array]) -> None:
+    probability, position, moment, member = find_modes(*mixture, *SPACE, NEVER.cell)
+    its_probability, its_position, its_moment, its_member = find_modes(*without_the_second(mixture), *SPACE, NEVER.cell)
     np.testing.assert_array_equal(probability, its_probability)
     np.testing.assert_array_equal(position, its_position)
     np.testing.assert_array_equal(moment, its_moment)
@@ -69,7 +70,7 @@ def test_it_has_no_free_share(mixture: tuple[Array, Array, Array]) -> None:
 @pytest.mark.parametrize("kind", sorted(BROKEN))
 def test_nothing_is_near_by_it(kind: str) -> None:
     position = np.array([-1.0, 5.0, 5.0])
-    assert not nearest_free(position, BROKEN[kind], 3.0, *SPACE)
+    assert not nearest_free(position, BROKEN[kind], *SPACE)
     np.testing.assert_array_equal(position, [-1.0, 5.0, 5.0])
 
 
