@@ -145,23 +145,13 @@ def build_table(
         tolerance=tolerance,
     )
     total = sum(plan.num_cells for plan in plans)
-    done = 0
-    built: list[BuiltStation] = []
-    with ExitStack() as stack:
-        engine: FittingEngine | None = None
-        for plan in plans:
-            station = keep_station(plan, job)
-            if station is None:
-                engine = engine or stack.enter_context(_start_engine(cluster, job))
-                station = build_station(plan, job, engine, _after(done, total, report))
-            built.append(station)
-            done += plan.num_cells
-    report("balancing", done, total)
+    built = _build_stations(plans, job, cluster, report)
+    report("balancing", total, total)
     built = _balanced(built, job)
     contents = [station.content for station in built]
     if not any(len(level.mixture) for content in contents for level in content.levels):
         raise BuildError("no ray of any station finds free space; check the stations' positions and fields of view")
-    report("writing", done, total)
+    report("writing", total, total)
     table_id = write_table(
         table_path,
         site=site.info(),
@@ -184,6 +174,24 @@ def build_table(
             *_dropped_warnings(stations),
         ),
     )
+
+
+def _build_stations(
+    plans: tuple[StationPlan, ...], job: Job, cluster: str | None, report: Progress
+) -> list[BuiltStation]:
+    """Build the parts of all stations; the engine, with the rays of the last one, is released at the end."""
+    total, done = sum(plan.num_cells for plan in plans), 0
+    built = []
+    with ExitStack() as stack:
+        engine: FittingEngine | None = None
+        for plan in plans:
+            station = keep_station(plan, job)
+            if station is None:
+                engine = engine or stack.enter_context(_start_engine(cluster, job))
+                station = build_station(plan, job, engine, _after(done, total, report))
+            built.append(station)
+            done += plan.num_cells
+    return built
 
 
 def _balanced(stations: list[BuiltStation], job: Job) -> list[BuiltStation]:
