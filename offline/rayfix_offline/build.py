@@ -144,11 +144,13 @@ def build_table(
     )
     with closing(ShardStore.beside(table_path)) as store:
         job = Job(site=site, twin=twin, method=method, store=store, jobs=jobs, former=former_table, tolerance=tolerance)
+        total = sum(plan.num_cells for plan in plans)
         built = _build_stations(plans, job, cluster, report)
+        report("balancing", total, total)
+        built = _balanced(built, job)
         contents = [station.content for station in built]
         if not any(len(level.mixture) for content in contents for level in content.levels):
             raise BuildError("no ray of any station finds free space; check the stations' positions and fields of view")
-        total = sum(plan.num_cells for plan in plans)
         report("writing", total, total)
         table_id = write_table(
             table_path,
@@ -178,7 +180,7 @@ def build_table(
 def _build_stations(
     plans: tuple[StationPlan, ...], job: Job, cluster: str | None, report: Progress
 ) -> list[BuiltStation]:
-    """Take over or build the parts of all stations, and balance them."""
+    """Take over or build the parts of all stations; the engine and its rays are released with the return."""
     total = sum(plan.num_cells for plan in plans)
     done = 0
     built: list[BuiltStation] = []
@@ -191,8 +193,7 @@ def _build_stations(
                 station = build_station(plan, job, engine, _after(done, total, report))
             built.append(station)
             done += plan.num_cells
-    report("balancing", done, total)
-    return _balanced(built, job)
+    return built
 
 
 def _balanced(stations: list[BuiltStation], job: Job) -> list[BuiltStation]:

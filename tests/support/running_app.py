@@ -31,7 +31,7 @@ async def serving(app: FastAPI) -> AsyncIterator[httpx.AsyncClient]:
         yield http
 
 
-async def until_ready(http: httpx.AsyncClient, seconds: float = 100.0) -> None:
+async def until_ready(http: httpx.AsyncClient, seconds: float = 600.0) -> None:
     """Wait until ``/readyz`` is 200."""
     async with asyncio.timeout(seconds):
         while (response := await http.get("/readyz")).status_code != httpx.codes.OK:
@@ -111,7 +111,7 @@ class RunningApp:
         """POST a body as it is, as JSON unless the headers say otherwise."""
         return self.request("POST", path, content=content, headers=JSON if headers is None else headers)
 
-    def wait_until_ready(self, seconds: float = 100.0) -> None:
+    def wait_until_ready(self, seconds: float = 600.0) -> None:
         """Wait until ``/readyz`` is 200."""
         self.run(until_ready(self.http, seconds))
 

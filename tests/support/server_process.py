@@ -70,7 +70,7 @@ class ServerProcess:
     @property
     def url(self) -> str:
         """Address, once it listens."""
-        assert self._listening.wait(60), "".join(self.log)
+        assert self._listening.wait(600), "".join(self.log)
         (address,) = re.findall(r"running on (http://127\.0\.0\.1:\d+)", "".join(self.log))
         return str(address)
 
@@ -83,7 +83,7 @@ class ServerProcess:
         """Return a client with connections of its own."""
         return httpx.Client(base_url=self.url, timeout=30, trust_env=False)
 
-    def wait_for(self, text: str, times: int = 1, seconds: float = 100.0) -> None:
+    def wait_for(self, text: str, times: int = 1, seconds: float = 600.0) -> None:
         """Wait until the log has had a text so many times."""
         deadline = time.monotonic() + seconds
         while sum(text in line for line in list(self.log)) < times:

@@ -64,7 +64,7 @@ def test_reports_of_all_kinds_find_their_kernels_compiled(hall_table_path: Path)
         [sys.executable, "-c", CODE, str(hall_table_path), reports],
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=1200,
         check=False,
     )
     assert done.returncode == 0, done.stderr
