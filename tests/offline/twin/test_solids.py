@@ -343,7 +343,7 @@ def test_vertices_that_are_shared_or_not_make_no_difference(room: NDArray[np.flo
 def test_half_of_the_triangles_turned_is_no_loss_of_volume(seed: int, room: NDArray[np.float64]) -> None:
     """A room and a sphere, in which any triangles face either way: volumes as large as when none is turned."""
     rng = np.random.default_rng(seed)
-    ball = (*np.asarray(trimesh.creation.icosphere(subdivisions=2, radius=0.4).triangles), 2.0, 2.5, 1.0)
+    ball = np.asarray(trimesh.creation.icosphere(subdivisions=2, radius=0.4).triangles) + np.array([2.0, 2.5, 1.0])
     for name, triangles in (("room", room), ("ball", ball)):
         (plain,) = parts_of(scene_of(**{name: triangles}))
         mixed = triangles.copy()

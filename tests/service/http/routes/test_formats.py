@@ -95,7 +95,7 @@ def test_a_known_height_moves_the_fix_there(hall_app: RunningApp):
         ("/v1/positions/nrppa", {**NRPPA, "stations": {}}, 422, None, "station '1' is not in the table"),
         ("/v1/positions/nrppa", LINES, 415, None, "application/json"),
         ("/v1/positions/ublox", NRPPA, 415, None, "text/plain"),
-        ("/v1/positions/ublox", "OK", 422, None, "no line begins with +UUDF:"),
+        ("/v1/positions/ublox", "OK", 422, None, "no line holds +UUDF:"),
         ("/v1/positions/ublox?station=a", LINES, 422, "station", "NAME=STATION"),
         ("/v1/positions/ublox?height_m=1", LINES, 422, "height", "give both numbers"),
         ("/v1/positions/silabs", {**SILABS, "angles": []}, 422, "angles", "an array of 1 to 256 angles"),
