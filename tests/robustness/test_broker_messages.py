@@ -16,14 +16,11 @@ from hypothesis import strategies as st
 from rayfix_service.adapters.mqtt import BrokerError, MqttSettings, check_settings, topic_for
 from rayfix_service.adapters.silabs_stream import MAX_PAYLOAD, SilabsStream
 from rayfix_service.fusion.locator import Locator
-from rayfix_service.http.openapi.examples import SILABS_EXAMPLES
 from rayfix_service.wire.names import MAX_NAME, in_log, topic_level
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table
-from tests.support.mqtt_broker import Mosquitto, broker_in, exchange, locating
+from tests.support.mqtt_broker import MESSAGE, TAG, Mosquitto, angles, broker_in, exchange, locating
 
-MESSAGE: dict[str, Any] = SILABS_EXAMPLES["three_locators"]["value"]
-TAG: str = MESSAGE["target_id"]
 SETTINGS = MqttSettings(window=0.5, stations=MESSAGE["stations"])
 
 SITE = SiteInfo(
@@ -36,17 +33,6 @@ SITE = SiteInfo(
         for name in ("bs1", "bs2", "bs3")
     ),
 )
-
-
-def angles(sequence: int, tag: str = TAG) -> list[tuple[str, dict[str, Any]]]:
-    """Topic and payload of each locator."""
-    return [
-        (
-            f"silabs/aoa/angle/{angle['locator_id']}/{tag}",
-            {key: value for key, value in {**angle, "sequence": sequence}.items() if key != "locator_id"},
-        )
-        for angle in MESSAGE["angles"]
-    ]
 
 
 @pytest.fixture(scope="module")

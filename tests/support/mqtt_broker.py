@@ -17,6 +17,21 @@ import pytest
 
 from rayfix_service.adapters.mqtt import Broker, MqttSettings, run_mqtt
 from rayfix_service.fusion.locator import Locator
+from rayfix_service.http.openapi.examples import SILABS_EXAMPLES
+
+MESSAGE: dict[str, Any] = SILABS_EXAMPLES["three_locators"]["value"]
+TAG: str = MESSAGE["target_id"]
+
+
+def angles(sequence: int = 1, tag: str = TAG) -> list[tuple[str, dict[str, Any]]]:
+    """Topic and payload of each locator."""
+    return [
+        (
+            f"silabs/aoa/angle/{angle['locator_id']}/{tag}",
+            {key: value for key, value in {**angle, "sequence": sequence}.items() if key != "locator_id"},
+        )
+        for angle in MESSAGE["angles"]
+    ]
 
 
 @dataclass

@@ -23,26 +23,12 @@ from rayfix_service.adapters.silabs import parse_silabs
 from rayfix_service.adapters.silabs_stream import SilabsStream
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Height
-from rayfix_service.http.openapi.examples import SILABS_EXAMPLES
 from rayfix_tables.table import Table
-from tests.support.mqtt_broker import Mosquitto, broker_in, exchange, locating
+from tests.support.mqtt_broker import MESSAGE, TAG, Mosquitto, angles, broker_in, exchange, locating
 
-MESSAGE: dict[str, Any] = SILABS_EXAMPLES["three_locators"]["value"]
 STATIONS: dict[str, str] = MESSAGE["stations"]
-TAG = MESSAGE["target_id"]
 # A table of four stations and three locators: a packet waits for the fourth.
 SETTINGS = MqttSettings(window=0.4, stations=STATIONS)
-
-
-def angles(sequence: int = 1) -> list[tuple[str, dict[str, Any]]]:
-    """Topic and payload of each locator."""
-    return [
-        (
-            f"silabs/aoa/angle/{angle['locator_id']}/{TAG}",
-            {key: value for key, value in {**angle, "sequence": sequence}.items() if key != "locator_id"},
-        )
-        for angle in MESSAGE["angles"]
-    ]
 
 
 @pytest.fixture(scope="module")
