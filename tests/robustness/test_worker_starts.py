@@ -1,7 +1,6 @@
 """Workers that cannot start, and what services that were killed leave behind."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from rayfix_service.http.access.keys import add_key
 from rayfix_service.http.answering.runtime_folder import runtime_folder
 from tests.support.hand_tables import line_of_sight, table_of
 from tests.support.server_process import start_server
+from tests.support.talking_process import TalkingProcess
 
 RUN = """\
     import os, sys, time
@@ -41,28 +41,10 @@ RUN = """\
     """
 
 
-class Run:
-    """A process that has workers, and what it has said."""
-
-    def __init__(self, *arguments: str) -> None:
-        command = [sys.executable, "-c", textwrap.dedent(RUN), *arguments]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        self.said = ""
-
-    def read(self, pattern: str) -> str:
-        """Read on until a line has a pattern; returns its group."""
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.said += line
-            if found := re.search(pattern, line):
-                return found[1] if found.groups() else found[0]
-        raise AssertionError(f"no {pattern!r} in:\n{self.said}")
-
-
 @contextmanager
-def running(*arguments: str) -> Iterator[Run]:
+def running(*arguments: str) -> Iterator[TalkingProcess]:
     """Run workers, and end them in any case, lest a test waits for ever for what is not said."""
-    run = Run(*arguments)
+    run = TalkingProcess(RUN, *arguments)
     limit = threading.Timer(100, run.process.kill)
     limit.start()
     try:

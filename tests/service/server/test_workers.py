@@ -3,13 +3,9 @@
 import gc
 import json
 import os
-import re
 import shutil
 import signal
 import socket
-import subprocess
-import sys
-import textwrap
 import threading
 import time
 import weakref
@@ -26,6 +22,7 @@ from rayfix_service.http.access.keys import add_key
 from rayfix_service.http.answering.served_tables import file_state, forget_changed, load_tables
 from tests.support.reports import REPORT
 from tests.support.server_process import start_server
+from tests.support.talking_process import TalkingProcess
 
 RUN = """\
     import os, sys, time
@@ -56,22 +53,8 @@ SERVE = """\
     """
 
 
-class Service:
+class Service(TalkingProcess):
     """A process that has workers, and what it has printed."""
-
-    def __init__(self, code: str, *arguments: str) -> None:
-        command = [sys.executable, "-c", textwrap.dedent(code), *arguments]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        self.said = ""
-
-    def read(self, pattern: str) -> str:
-        """Read on until a line has a pattern; returns its group."""
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.said += line
-            if found := re.search(pattern, line):
-                return found[1] if found.groups() else found[0]
-        raise AssertionError(f"no {pattern!r} in:\n{self.said}")
 
     def worker(self) -> int:
         """Read on until a worker tells of its process, and return that."""
