@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from rayfix_offline.fit.settings import BalanceSettings
 from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.gaussians.conditioning import LOG_2PI, condition_on_angle
+from rayfix_tables.gaussians.conditioning import condition_on_angle
+from rayfix_tables.gaussians.constants import LOG_2PI
 from rayfix_tables.gaussians.definite import cholesky_factors
 from rayfix_tables.gaussians.normal_points import normal_points
 from rayfix_tables.level import UNBALANCED, Level

@@ -34,6 +34,11 @@ _FEWER_HYPOTHESES = (
     "time differences that are connected"
 )
 
+_SINGULAR = (
+    "{} Gaussians were left out, since rounding made their covariances singular; give standard deviations that differ "
+    "less in size"
+)
+
 
 class Locator:
     """Answers reports from a table.
@@ -141,6 +146,8 @@ class Locator:
             simplified.append(_FEWER_ERRORS.format(bounded))
         if hypotheses is not None and hypotheses.omitted:
             simplified.append(_FEWER_HYPOTHESES)
+        if hypotheses is not None and hypotheses.dropped:
+            simplified.append(_SINGULAR.format(hypotheses.dropped))
         return Product(observations, unused, prior, hypotheses, tuple(simplified))
 
     def _factors(

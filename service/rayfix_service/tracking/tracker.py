@@ -59,6 +59,11 @@ class Tracker:
     settings : TrackingSettings, optional
     clock : callable, optional
         The service's clock, s, by which targets are forgotten; reports have their own times.
+
+    Attributes
+    ----------
+    dropped : int
+        Hypotheses that updates have left out since their products with a track were singular.
     """
 
     def __init__(
@@ -66,6 +71,7 @@ class Tracker:
     ) -> None:
         self.settings = settings or TrackingSettings()
         self._walls = walls_of(scene)
+        self.dropped = 0
         self._clock = clock
         self._tracks: OrderedDict[str, _Track] = OrderedDict()  # the one heard of last comes last
         self._lock = Lock()
@@ -180,6 +186,7 @@ class Tracker:
             updated = update(particles, likelihood, self.settings.motion, step, self._walls, rng)
         if updated is None:
             return self._newborn(fused, rng), "restarted"
+        self.dropped += updated.dropped
         share = self._restart_share(fused.fix.log_evidence - updated.log_evidence)
         newborn = self._newborn(fused, rng) if 2.0 * share * self.settings.num_particles > 1.0 else None
         if newborn is None:

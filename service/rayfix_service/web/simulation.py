@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rayfix_tables.angles import wrap
 from rayfix_tables.errors import ReportError
+from rayfix_tables.gaussians.definite import is_definite
 from rayfix_tables.mixture import joint_cov
 from rayfix_tables.table import StationPart, Table
 
@@ -38,6 +39,8 @@ class SimulatedPath:
         From the station towards the incoming ray, in the scene frame.
     path_length : float, m
     num_reflections : int
+    dropped : int
+        Components near the place that were left out because rounding made their covariances singular.
     """
 
     station_id: str
@@ -45,6 +48,7 @@ class SimulatedPath:
     zenith: float
     path_length: float
     num_reflections: int
+    dropped: int = 0
 
 
 def find_path(part: StationPart, place: NDArray[np.float64]) -> SimulatedPath | None:
@@ -62,6 +66,12 @@ def find_path(part: StationPart, place: NDArray[np.float64]) -> SimulatedPath | 
     apart = ((mixture.x_mean - place.astype(np.float32)) ** 2).sum(axis=1)
     near = np.arange(len(apart)) if len(apart) <= _NEAREST else np.argpartition(apart, _NEAREST)[:_NEAREST]
     cov = joint_cov(mixture[near])
+    definite = is_definite(cov[:, 3:, 3:])
+    dropped = len(near) - int(np.count_nonzero(definite))
+    if dropped:
+        near, cov = near[definite], cov[definite]
+        if not len(near):
+            return None
     cross, x_cov = cov[:, :3, 3:], cov[:, 3:, 3:]
     from_mean = place - mixture.x_mean[near]
     gain = np.linalg.solve(x_cov, from_mean[:, :, None])[:, :, 0]
@@ -81,6 +91,7 @@ def find_path(part: StationPart, place: NDArray[np.float64]) -> SimulatedPath | 
         zenith=float(np.clip(zenith + vertical, 0.0, np.pi)),
         path_length=float(length),
         num_reflections=int(mixture.num_reflections[near[best]]),
+        dropped=dropped,
     )
 
 

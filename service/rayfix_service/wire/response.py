@@ -60,7 +60,8 @@ class FixDocument(BaseModel):
     measurements: list[OutcomeDocument]
     simplified: list[str] = Field(
         default=[],
-        description="what was worked out more coarsely than the report says, since the work for one report is bounded; "
+        description="what was worked out more coarsely than the report says, since the work for one report is bounded "
+        "or because rounding made covariances singular; "
         "absent for nearly all reports",
     )
     table_id: str

@@ -5,7 +5,7 @@ from typing import Any
 import numba
 import numpy as np
 
-LOG_2PI = 1.8378770664093453
+from rayfix_tables.gaussians.constants import LOG_2PI
 
 
 @numba.njit(cache=True, nogil=True)

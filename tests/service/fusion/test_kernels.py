@@ -27,6 +27,7 @@ from rayfix_service.fusion.stopping import NEVER
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.conditioning import condition_on_angle
 from rayfix_tables.gaussians.normal_points import unit_points
+from rayfix_tables.gaussians.triangles import triangle
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture, pack, unpack
@@ -89,7 +90,7 @@ def log_integrals(functions: Functions) -> Array:
 def columns_of(gaussians: Functions, times: Times, dimension: int) -> Functions:
     """Functions that Gaussians over (x, path length) and times of arrival become, by the kernel."""
     readings = np.array(list(zip(*times, strict=True)), factor_kernels.READING)
-    columns = np.empty((information_form.triangle(dimension) + dimension + 1, len(gaussians[0])))
+    columns = np.empty((triangle(dimension) + dimension + 1, len(gaussians[0])))
     factor_kernels.to_columns(*gaussians, readings, dimension, columns)
     return information_form.unpack(columns)
 
@@ -247,7 +248,10 @@ def extend_beam(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Products by the kernel, the best first."""
     columns = information_form.pack(*hypotheses), information_form.pack(*factor)
-    parent, choice, score = beam_kernels.extend_beam(*columns, width, hopeless, LOG_VOLUME, LOG_RANGE, NEVER.cell)
+    parent, choice, score, dropped = beam_kernels.extend_beam(
+        *columns, width, hopeless, LOG_VOLUME, LOG_RANGE, NEVER.cell
+    )
+    assert dropped == 0
     order = np.argsort(-score)
     return parent[order], choice[order], score[order]
 

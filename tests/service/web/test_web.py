@@ -169,6 +169,23 @@ def test_a_simulated_path_is_one_of_the_forward_solvers(table: Table):
         assert np.any((apart < 0.5) & (off < 0.1) & (exact.num_reflections == path.num_reflections)), station_id
 
 
+def test_a_simulated_path_is_of_no_component_without_a_covariance(table: Table):
+    part = table.parts["bs1"]
+    (finest, *others), place = part.levels, np.array(EXAMPLE_POSITION)
+    whole = find_path(part, place)
+    assert whole is not None
+    broken = finest.mixture.x_cov.copy()
+    jacobian = finest.mixture.jacobian.copy()
+    broken[::2], jacobian[::2] = 0.0, 0.0
+    mixture = replace(finest.mixture, x_cov=broken, jacobian=jacobian)
+    found = find_path(replace(part, levels=(replace(finest, mixture=mixture), *others)), place)
+    assert found is not None
+    assert whole.dropped == 0
+    assert 0 < found.dropped < len(mixture)
+    mixture = replace(mixture, x_cov=np.zeros_like(broken), jacobian=np.zeros_like(jacobian))
+    assert find_path(replace(part, levels=(replace(finest, mixture=mixture), *others)), place) is None
+
+
 def test_a_simulation_is_located_where_it_was(web: RunningApp):
     wanted = {"position": list(EXAMPLE_POSITION), "angle_stdev_deg": 0.25, "range_stdev_m": 0.1, "seed": 3}
     document = web.post("/v1/simulations", wanted).json()

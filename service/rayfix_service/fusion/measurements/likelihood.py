@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from rayfix_service.fusion.measurements.report import ErrorModel
-
-_LOG_2PI = math.log(2.0 * math.pi)
+from rayfix_tables.gaussians.constants import LOG_2PI
 
 _NARROW = 0.25
 """Standard deviation of a logarithm up to which the log-normal is cut no finer than in two: an error of 25 %."""
@@ -105,8 +104,8 @@ def product(terms: Sequence[Term], shared_variance: float) -> Term:
         return Term(terms[0].log_weight, terms[0].value, terms[0].variance + shared_variance)
     precision = sum(1.0 / term.variance for term in terms)
     value = sum(term.value / term.variance for term in terms) / precision
-    log_weight = 0.5 * (_LOG_2PI - math.log(precision))
+    log_weight = 0.5 * (LOG_2PI - math.log(precision))
     for term in terms:
         square = (term.value - value) ** 2 / term.variance
-        log_weight += term.log_weight - 0.5 * (square + math.log(term.variance) + _LOG_2PI)
+        log_weight += term.log_weight - 0.5 * (square + math.log(term.variance) + LOG_2PI)
     return Term(log_weight, value, 1.0 / precision + shared_variance)

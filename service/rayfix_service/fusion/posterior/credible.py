@@ -13,10 +13,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.posterior.cholesky import cholesky
 from rayfix_service.fusion.posterior.order_statistics import nth_smallest
 from rayfix_service.fusion.posterior.points import Points
 from rayfix_service.fusion.posterior.principal_axes import semi_axes
+from rayfix_tables.gaussians.cholesky import cholesky
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,7 +32,8 @@ class Product(NamedTuple):
     prior : Prior
     hypotheses : Hypotheses or None
     simplified : tuple of str
-        What was worked out more coarsely than the report says, since the work per report is bounded.
+        What was worked out more coarsely than the report says, since the work per report is bounded or because rounding made
+        covariances singular.
     """
 
     observations: list[Observation]
@@ -68,11 +69,13 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
     hypotheses = product.hypotheses
     if hypotheses is not None:
         found = outlier_index(product.observations)
-        if not len(hypotheses):
+        summary = None
+        if len(hypotheses):
+            summary = sum_up(hypotheses, found, table.scene.free_space, settings.hypothesis_floor, stop)
+        if summary is None or not len(summary.probability):
             log_evidence, status = hypotheses.log_all_outlier, "inconsistent"
             outlier = dict.fromkeys(found.places, 1.0)
         else:
-            summary = sum_up(hypotheses, found, table.scene.free_space, settings.hypothesis_floor, stop)
             log_evidence, share = summary.log_evidence, 1.0 - summary.lost
             candidates = tuple(
                 Candidate(probability=p * share, position=summary.position[n], covariance=summary.moment[n])

@@ -8,8 +8,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from rayfix_service.fusion.posterior.cholesky import cholesky, invert, solve
 from rayfix_service.fusion.posterior.voxels import is_free_place, nearest_free
+from rayfix_tables.gaussians.cholesky import cholesky, invert, solve
 
 _SAME_MODE = 9.0
 """Two maxima nearer than this, squared and in what either is uncertain by, count as one mode."""

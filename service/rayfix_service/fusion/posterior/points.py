@@ -11,8 +11,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.posterior.cholesky import cholesky, log_sum
 from rayfix_service.fusion.posterior.voxels import in_voxels, is_free
+from rayfix_tables.gaussians.cholesky import cholesky, log_sum
 from rayfix_tables.gaussians.normal_points import normal_points
 
 IN_SOLID = -1

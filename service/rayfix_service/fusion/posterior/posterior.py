@@ -15,6 +15,7 @@ from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.gaussians.constants import LOG_2PI
 from rayfix_tables.gaussians.definite import cholesky_factors
 from rayfix_tables.gaussians.normal_points import normal_points
 
@@ -74,7 +75,7 @@ class Posterior:
         free = np.flatnonzero(self.free_space.contains(places))
         roots = np.linalg.inv(np.linalg.cholesky(self.cov))
         log_scale = self.log_weight + np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
-        log_scale -= 1.5 * np.log(2.0 * np.pi)
+        log_scale -= 1.5 * LOG_2PI
         step = max(1, _CHUNK // (3 * max(len(self.mean), 1)))
         for begin in range(0, len(free), step):
             chunk = free[begin : begin + step]

@@ -7,7 +7,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.posterior.cholesky import log_sum
 from rayfix_service.fusion.posterior.cut_by_walls import cut_to_free_space
 from rayfix_service.fusion.posterior.modes import find_modes
 from rayfix_service.fusion.posterior.points import DrawnPoints, draw_points
@@ -15,6 +14,7 @@ from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.outliers import OutlierIndex, outlier_probabilities
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.gaussians.cholesky import log_sum
 from rayfix_tables.gaussians.normal_points import normal_points, unit_points
 
 _NUM_POINTS = 1024
@@ -60,7 +60,8 @@ def sum_up(
     Parameters
     ----------
     hypotheses : Hypotheses
-        At least one.
+        At least one. One whose covariance is not positive definite has no weight; where no other is, there are no
+        modes and everything is outliers.
     floor : float
         Hypotheses whose share of the posterior is below this are left out of the modes.
     stop : Stop
@@ -116,7 +117,8 @@ def _sum_up(
     log_found = log_sum(log_cut)
     log_evidence = np.logaddexp(log_found, log_all_outlier)
     lost = np.exp(log_all_outlier - log_evidence)
-    log_cut -= log_found
+    if log_found > -np.inf:
+        log_cut -= log_found
     keep = np.flatnonzero(log_cut > log_floor)
     kept = log_cut[keep], cut_mean[keep], cut_cov[keep]
     probability, position, moment, _ = find_modes(*kept, origin, voxel_size, free, stop)

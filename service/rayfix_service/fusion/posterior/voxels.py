@@ -5,7 +5,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from rayfix_service.fusion.posterior.cholesky import cholesky, invert
+from rayfix_tables.gaussians.cholesky import cholesky, invert
 
 _BLOCK = 8
 """Voxels along each side of a block that is searched at a time."""

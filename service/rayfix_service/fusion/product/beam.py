@@ -27,12 +27,15 @@ class Hypotheses:
         Log evidence, the best first.
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
+        Positive definite, if :func:`multiply` made them.
     outlier : ndarray of int8, shape (h, n_factors)
         What the hypothesis takes for an outlier in each factor.
     log_all_outlier : float
         Log evidence of the hypothesis that all factors are outliers, which is none of the above.
     omitted : int
         Hypotheses that were left out because there were too many products to form.
+    dropped : int
+        Alternatives and products that were left out because rounding made their matrices singular.
     """
 
     log_weight: NDArray[np.float64]
@@ -41,6 +44,7 @@ class Hypotheses:
     outlier: NDArray[np.int8]
     log_all_outlier: float
     omitted: int = 0
+    dropped: int = 0
 
     def __len__(self) -> int:
         """Return the number of hypotheses."""
@@ -96,7 +100,7 @@ def multiply(
     columns = np.concatenate([factor.columns for factor in factors], axis=1)
     outlier = np.concatenate([factor.outlier for factor in factors])
     offsets = np.array([0, *itertools.accumulate([len(factor) for factor in factors])])
-    log_weight, mean, cov, outlier, log_all_outlier, omitted = multiply_factors(
+    log_weight, mean, cov, outlier, log_all_outlier, omitted, dropped = multiply_factors(
         columns,
         outlier,
         offsets,
@@ -111,5 +115,11 @@ def multiply(
     )
     stop.check()
     return Hypotheses(
-        log_weight=log_weight, mean=mean, cov=cov, outlier=outlier, log_all_outlier=log_all_outlier, omitted=omitted
+        log_weight=log_weight,
+        mean=mean,
+        cov=cov,
+        outlier=outlier,
+        log_all_outlier=log_all_outlier,
+        omitted=omitted,
+        dropped=dropped + sum([factor.dropped for factor in factors]),
     )

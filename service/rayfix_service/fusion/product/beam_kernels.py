@@ -9,8 +9,10 @@ from typing import Any
 import numba
 import numpy as np
 
-from rayfix_service.fusion.product.information_form import add, dimension_of, invert_all, log_integrals, triangle
+from rayfix_service.fusion.product.information_form import add, dimension_of, invert_all, log_integrals
 from rayfix_service.fusion.product.merging import merge_hypotheses
+from rayfix_tables.gaussians.cholesky import cholesky
+from rayfix_tables.gaussians.triangles import triangle
 
 HOPELESS = 20.0
 """A product this many nats below the best is given up: more than one station to come would have to be an outlier."""
@@ -63,18 +65,21 @@ def multiply_factors(
         Of the hypotheses that place the UE, the best first.
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
+        Positive definite.
     outlier : ndarray of int8, shape (h, n)
     log_all_outlier : float
         Log evidence of the hypothesis that all factors are outliers, which is none of the above.
     omitted : int
         Hypotheses that ``most_products`` left out.
+    dropped : int
+        Products that were left out because rounding made their matrices singular.
     """
     beam = _prior_column(dimension_of(alternatives), precision, eta, log_volume, log_range)
     chosen = np.zeros((1, len(offsets) - 1), np.int8)
     pattern = np.zeros(1, np.int64)
     score = np.zeros(1)
     product_cost, merge_cost = product_costs(dimension_of(alternatives))
-    left_over, omitted = most_products, 0
+    left_over, omitted, dropped = most_products, 0, 0
     order = _order(alternatives[-1], offsets)
     for place in range(len(order)):
         if stop[0] != 0:
@@ -89,7 +94,8 @@ def multiply_factors(
             omitted += beam.shape[1] - most
             beam = np.ascontiguousarray(beam[:, :most])
         kept = max(1, min(width, int(share / merge_cost)))
-        parent, choice, score = extend_beam(beam, own, kept, HOPELESS, log_volume, log_range, stop)
+        parent, choice, score, singular = extend_beam(beam, own, kept, HOPELESS, log_volume, log_range, stop)
+        dropped += singular
         if kept < width and len(score) == kept:
             omitted += 1  # at least
         left_over -= product_cost * beam.shape[1] * (end - begin) + merge_cost * len(score)
@@ -112,8 +118,8 @@ def multiply_factors(
     log_all_outlier = 0.0
     for factor in range(len(offsets) - 1):
         log_all_outlier += alternatives[-1, offsets[factor + 1] - 1]
-    log_weight, mean, cov, chosen = _placed(beam, score, chosen)
-    return log_weight, mean, cov, chosen, log_all_outlier, omitted
+    log_weight, mean, cov, chosen, singular = place_hypotheses(beam, score, chosen)
+    return log_weight, mean, cov, chosen, log_all_outlier, omitted, dropped + singular
 
 
 @numba.njit(cache=True, nogil=True)
@@ -199,6 +205,8 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
         Hypothesis and alternative of each product, in no order.
     score : ndarray of shape (n,)
         Log evidence of each product.
+    dropped : int
+        Products that were left out because rounding made their matrices singular.
     """
     count = factor.shape[1]
     products = np.empty(factor.shape)
@@ -207,7 +215,7 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
     parent, choice = np.empty(most, np.int64), np.empty(most, np.int64)
     score = np.empty(most)
     heap = np.empty(most, np.int64)
-    kept = 0
+    kept, dropped = 0, 0
     top = -np.inf
     for h in range(beam.shape[1]):
         if stop[0] != 0:
@@ -216,7 +224,8 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
         log_integrals(products, log_volume, log_range, scratch, values)
         for k in range(count):
             value = values[k]
-            if not value >= top - hopeless:
+            if not value >= top - hopeless or value == -np.inf:
+                dropped += not value > -np.inf
                 continue
             top = max(top, value)
             if kept < most:
@@ -228,7 +237,7 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
                 parent[slot], choice[slot], score[slot] = h, k, value
                 _sift_down(score, heap, kept)
     hopeful = np.flatnonzero(score[:kept] >= top - hopeless)
-    return parent[hopeful], choice[hopeful], score[hopeful]
+    return parent[hopeful], choice[hopeful], score[hopeful], dropped
 
 
 @numba.njit(cache=True, nogil=True)
@@ -258,26 +267,48 @@ def _sift_down(scores: Any, heap: Any, count: Any) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _placed(beam: Any, score: Any, chosen: Any) -> Any:
-    """Means and covariances of the position, of the hypotheses that say something of it."""
+def place_hypotheses(beam: Any, score: Any, chosen: Any) -> Any:
+    """Give means and covariances of the position, of the hypotheses that say something of it.
+
+    Parameters
+    ----------
+    beam : ndarray of shape (rows, h)
+        Hypotheses, as :mod:`rayfix_service.fusion.product.information_form` has them.
+    score : ndarray of shape (h,)
+        Log evidence.
+    chosen : ndarray of int8, shape (h, n)
+        What each hypothesis takes for an outlier.
+
+    Returns
+    -------
+    score, mean, cov, chosen : ndarray
+        Of the hypotheses that place the UE; covariances are positive definite.
+    dropped : int
+        Hypotheses that were left out because rounding made their matrices singular.
+    """
     dimension = dimension_of(beam)
     first = triangle(dimension)
-    cov = beam.copy()
+    inverse = beam.copy()
     for clock in range(3, dimension):
-        pivot = cov[triangle(clock) + clock]
+        pivot = inverse[triangle(clock) + clock]
         for h in range(len(pivot)):
             if pivot[h] <= 0.0:
                 # Of a clock that nothing constrains only this entry is not zero; it changes nothing else.
                 pivot[h] = 1.0
     det = np.empty(len(score))
-    invert_all(cov, dimension, det)
-    placed = np.flatnonzero((beam[0] > 0.0) & (score > -np.inf) & (det > 0.0))
-    means, covs = np.zeros((len(placed), 3)), np.empty((len(placed), 3, 3))
-    for n in range(len(placed)):
-        h = placed[n]
+    invert_all(inverse, dimension, det)
+    placing = np.flatnonzero((beam[0] > 0.0) & (score > -np.inf))
+    means, covs = np.zeros((len(placing), 3)), np.empty((len(placing), 3, 3))
+    lower = np.empty((3, 3))
+    definite = np.zeros(len(placing), np.bool_)
+    for n in range(len(placing)):
+        h = placing[n]
         for i in range(3):
             for j in range(dimension):
-                means[n, i] += cov[triangle(max(i, j)) + min(i, j), h] * beam[first + j, h]
+                means[n, i] += inverse[triangle(max(i, j)) + min(i, j), h] * beam[first + j, h]
             for j in range(3):
-                covs[n, i, j] = cov[triangle(max(i, j)) + min(i, j), h]
-    return score[placed], means, covs, chosen[placed]
+                covs[n, i, j] = inverse[triangle(max(i, j)) + min(i, j), h]
+        definite[n] = det[h] > 0.0 and cholesky(covs[n], lower)
+    kept = np.flatnonzero(definite)
+    placed = placing[kept]
+    return score[placed], means[kept], covs[kept], chosen[placed], len(placing) - len(kept)

@@ -5,9 +5,10 @@ from typing import Any
 import numba
 import numpy as np
 
-from rayfix_service.fusion.product.information_form import integrate_last, invert_all, triangle
+from rayfix_service.fusion.product.information_form import integrate_last, invert_all
 from rayfix_service.fusion.product.merging import NO_NOISE, merge_gaussians
-from rayfix_tables.gaussians.conditioning import LOG_2PI
+from rayfix_tables.gaussians.constants import LOG_2PI
+from rayfix_tables.gaussians.triangles import triangle
 
 ALL_GOOD, TIME_OUTLIER, ALL_OUTLIER = 0, 1, 2
 """What an alternative takes for an outlier: nothing, the observation's times, or all of it."""
@@ -88,6 +89,8 @@ def make_alternatives(
     outlier : ndarray of int8, shape (n,)
     omitted : int
         How many more there would be than ``most``.
+    dropped : int
+        Alternatives that were left out because rounding made their covariances singular.
     """
     offsets = np.zeros(len(parts) + 1, np.int64)
     for p in range(len(parts)):
@@ -105,7 +108,7 @@ def make_alternatives(
         np.empty(room, np.int8),
         np.empty(room),
     )
-    done, omitted = 0, 0
+    done, omitted, dropped = 0, 0, 0
     for p in range(len(parts)):
         if stop[0] != 0:
             break
@@ -120,6 +123,13 @@ def make_alternatives(
         own_readings = readings[part["first_reading"] : part["last_reading"]]
         out = slice(done, done + len(left))
         to_columns(own_log[left], own_mean[left], own_cov[left], own_readings, dimension, columns[:, out])
+        proper = np.flatnonzero(columns[-1, out] > -np.inf)
+        if len(proper) < len(left):
+            dropped += len(left) - len(proper)
+            for row in range(len(columns)):
+                columns[row, done : done + len(proper)] = columns[row, done + proper]
+            left = left[proper]
+            out = slice(done, done + len(left))
         outlier[out] = part["outlier"]
         value[out] = own_log[left] + part["log_clocks"]
         done = out.stop
@@ -133,7 +143,7 @@ def make_alternatives(
     columns[:-1, done] = 0.0
     columns[-1, done] = log_outlier
     outlier[done] = ALL_OUTLIER
-    return columns[:, : done + 1].copy(), outlier[: done + 1].copy(), omitted
+    return columns[:, : done + 1].copy(), outlier[: done + 1].copy(), omitted, dropped
 
 
 @numba.njit(cache=True, nogil=True)
@@ -221,8 +231,8 @@ def to_columns(log_evidence: Any, mean: Any, cov: Any, readings: Any, dimension:
     dimension : int
         Of the state.
     out : ndarray of shape (rows, n)
-        Columns as :mod:`~rayfix_service.fusion.product.information_form` has them. A Gaussian that the table's rounding
-        has made singular becomes a function without weight.
+        Columns as :mod:`~rayfix_service.fusion.product.information_form` has them. A Gaussian that rounding has made
+        singular becomes a function without weight, which the caller leaves out and counts.
     """
     count = len(log_evidence)
     size = 4 if len(readings) else 3

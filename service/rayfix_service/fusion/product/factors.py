@@ -38,12 +38,15 @@ class Factor:
         Alternatives that were looked at for it.
     omitted : bool
         Whether it has fewer alternatives than it would have without a bound on them.
+    dropped : int
+        Alternatives that were left out because rounding made their covariances singular.
     """
 
     columns: NDArray[np.float64]
     outlier: NDArray[np.int8]
     considered: int = 0
     omitted: bool = False
+    dropped: int = 0
 
     def __len__(self) -> int:
         """Return the number of alternatives."""
@@ -108,7 +111,7 @@ def make_factor(
     most = settings.most_alternatives
     if num_clocks:
         most = int(most / math.sqrt(product_costs(3 + num_clocks)[0]))
-    columns, outlier, omitted = make_alternatives(
+    columns, outlier, omitted, dropped = make_alternatives(
         *join(mixtures),
         np.array(taken, PART),
         np.array(readings, READING),
@@ -128,6 +131,7 @@ def make_factor(
         outlier=outlier,
         considered=max(bounds[-1], considered),
         omitted=omitted > 0 or len(taken) < len(parts),
+        dropped=dropped,
     )
 
 

@@ -19,7 +19,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.gaussians.conditioning import LOG_2PI
+from rayfix_tables.gaussians.constants import LOG_2PI
+from rayfix_tables.gaussians.triangles import triangle
 
 Array = NDArray[np.float64]
 
@@ -49,12 +50,6 @@ def unpack(columns: Array) -> tuple[Array, Array, Array]:
     information = np.empty((columns.shape[1], dimension, dimension))
     information[:, i, j] = information[:, j, i] = columns[:first].T
     return information, columns[first:-1].T.copy(), columns[-1].copy()
-
-
-@numba.njit(cache=True, nogil=True)
-def triangle(size: Any) -> Any:
-    """Return the number of entries of the lower triangle of a matrix."""
-    return size * (size + 1) // 2
 
 
 @numba.njit(cache=True, nogil=True)
