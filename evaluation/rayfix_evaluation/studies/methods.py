@@ -20,8 +20,8 @@ from rayfix_evaluation.drops.simulate import Timing
 from rayfix_evaluation.paper.locate import PaperLocator
 from rayfix_evaluation.studies.plain_mixtures import PlainTableLocator
 from rayfix_evaluation.studies.summary import COVERAGE
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Height, Report
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 
 __all__ = ["METHODS", "Answer", "Method", "Question", "Tools"]

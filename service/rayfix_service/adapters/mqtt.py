@@ -18,8 +18,8 @@ from rayfix_service.adapters.adapted import Adapted
 from rayfix_service.adapters.formats import OutputFormat, write
 from rayfix_service.adapters.omlox_hub import HubSettings, OmloxHub, open_hub
 from rayfix_service.adapters.silabs_stream import SilabsStream
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Frame, Height
+from rayfix_service.locator import Locator
 from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire.names import MAX_NAME, in_log, topic_level
 from rayfix_tables.errors import RayfixError, ReportError
@@ -169,7 +169,7 @@ async def run_mqtt(
     stream = SilabsStream(
         site, window=settings.window, stations=settings.stations, frame=settings.frame, height=settings.height
     )
-    tracker = Tracker(locator.table.scene) if settings.track else None
+    tracker = Tracker(locator.table) if settings.track else None
     async with open_hub(settings.hub) as hub:
         session = _Session(locator=locator, settings=settings, stream=stream, tracker=tracker, hub=hub)
         try:

@@ -10,8 +10,8 @@ from time import monotonic
 
 import numpy as np
 
-from rayfix_service.fusion.locator import Fused
 from rayfix_service.fusion.posterior.credible import CredibleRegions
+from rayfix_service.fusion.posterior.fused import Fused
 from rayfix_service.fusion.posterior.points import ListedPoints
 from rayfix_service.measuring.timestamps import utc_moment
 from rayfix_service.tracking.estimate import estimate
@@ -21,7 +21,7 @@ from rayfix_service.tracking.settings import TrackingSettings
 from rayfix_service.tracking.track import TrackedPosition, TrackState
 from rayfix_service.tracking.walls import walls_of
 from rayfix_tables.errors import ReportError
-from rayfix_tables.table import Scene
+from rayfix_tables.table import Scene, Table
 
 _MOST_HYPOTHESES = 512
 """Of a report, the best are taken in: each meets all particles, and few reports have a quarter as many."""
@@ -50,12 +50,12 @@ class _Track:
 
 
 class Tracker:
-    """Follows targets through one building. It may be used from several threads.
+    """Follows targets from report to report through one building; see docs/tracking.md. Threads may share it.
 
     Parameters
     ----------
-    scene : Scene
-        The table's scene, whose surfaces no target passes.
+    table : Table or Scene
+        Its scene's surfaces block the motion of targets.
     settings : TrackingSettings, optional
     clock : callable, optional
         The service's clock, s, by which targets are forgotten; reports have their own times.
@@ -67,10 +67,10 @@ class Tracker:
     """
 
     def __init__(
-        self, scene: Scene, settings: TrackingSettings | None = None, *, clock: Callable[[], float] = monotonic
+        self, table: Table | Scene, settings: TrackingSettings | None = None, *, clock: Callable[[], float] = monotonic
     ) -> None:
         self.settings = settings or TrackingSettings()
-        self._walls = walls_of(scene)
+        self._walls = walls_of(table.scene if isinstance(table, Table) else table)
         self.dropped = 0
         self._clock = clock
         self._tracks: OrderedDict[str, _Track] = OrderedDict()  # the one heard of last comes last

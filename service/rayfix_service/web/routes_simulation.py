@@ -7,7 +7,6 @@ import numpy as np
 from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.stopping import Stop
 from rayfix_service.http.answering.slow_work import Asked_contra, Stoppable
 from rayfix_service.http.openapi.examples import REPORT_EXAMPLES
@@ -21,6 +20,7 @@ from rayfix_service.http.problems import (
     problem_responses,
 )
 from rayfix_service.http.routes.dependencies import ReportBody, ServicesDep, TableDep
+from rayfix_service.locator import Locator
 from rayfix_service.web.documents import (
     PosteriorDocument,
     SimulationDocument,

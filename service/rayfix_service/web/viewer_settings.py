@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.stopping import NEVER, Stop
+from rayfix_service.locator import Locator
 from rayfix_service.web.documents import ViewerSettings, posterior_document
 from rayfix_tables.table import Table
 

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import (
     GAUSSIAN,
     HEAVY_TAILED,
@@ -24,6 +23,7 @@ from rayfix_service.fusion.measurements.report import (
     TimeOfArrival,
 )
 from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.locator import Locator
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
 

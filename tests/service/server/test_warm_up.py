@@ -8,7 +8,7 @@ from pathlib import Path
 CODE = """
 import json, pkgutil, importlib, sys
 import rayfix_service.fusion, rayfix_tables.gaussians.tree_reduction
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
 from rayfix_tables.table import Table
 

@@ -13,8 +13,8 @@ import pytest
 import trimesh
 
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.http.answering.table_cache import TableCache
+from rayfix_service.locator import Locator
 from rayfix_service.web import assets
 from rayfix_service.web.documents import MixtureDocument, mixture_document
 from rayfix_service.web.glb import NO_MATERIAL, write_glb

@@ -73,7 +73,8 @@ class Fix:
     confidence : float
         Probability that the report wants regions of.
     simplified : tuple of str
-        What was worked out more coarsely than the report says, since the work per report is bounded; mostly empty.
+        What was worked out more coarsely than the report says, since the work per report is bounded or because
+        rounding made covariances singular; mostly empty.
     """
 
     status: Status

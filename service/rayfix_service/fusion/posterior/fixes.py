@@ -32,8 +32,8 @@ class Product(NamedTuple):
     prior : Prior
     hypotheses : Hypotheses or None
     simplified : tuple of str
-        What was worked out more coarsely than the report says, since the work per report is bounded or because rounding made
-        covariances singular.
+        What was worked out more coarsely than the report says, since the work per report is bounded or because
+        rounding made covariances singular.
     """
 
     observations: list[Observation]

@@ -13,9 +13,9 @@ from pydantic_core import from_json, to_json
 from rayfix_service.adapters.adapted import Adapted, error_in_message
 from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.omlox_hub import OmloxHub
-from rayfix_service.fusion.locator import Fused
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.fusion.posterior.fused import Fused
 from rayfix_service.fusion.stopping import NEVER
 from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.response_options import ResponseOptions

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.http.answering.table_checks import TableChecks
 from rayfix_service.http.answering.table_files import FileState, FoundFiles, TableFiles, file_state, no_table
 from rayfix_service.http.problems import INVALID_PARAMETER, NOT_FOUND, NOT_READY, ProblemError
 from rayfix_service.http.telemetry.metrics import Metrics
+from rayfix_service.locator import Locator
 from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire import FieldProblem
 from rayfix_tables.checked import VERDICTS
@@ -110,7 +110,7 @@ def _warmed_up(served: ServedTable) -> ServedTable:
 
 
 def _serve(name: str, table: Table, state: FileState) -> ServedTable:
-    return ServedTable(name=name, locator=Locator(table), tracker=Tracker(table.scene), state=state)
+    return ServedTable(name=name, locator=Locator(table), tracker=Tracker(table), state=state)
 
 
 def load_tables(path: Path, *, checks: TableChecks | None = None) -> dict[str, ServedTable]:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.observations import sort_report
 from rayfix_service.fusion.posterior.fixes import Product, make_fix
 from rayfix_service.fusion.posterior.summary import sum_up
@@ -22,6 +21,7 @@ from rayfix_service.fusion.product.outliers import OutlierIndex
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER
+from rayfix_service.locator import Locator
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.cholesky import cholesky
 from tests.support.hand_reports import angle_of, report_of
@@ -139,7 +139,7 @@ def test_a_fix_says_that_gaussians_were_left_out(make_table: MakeTable, monkeypa
     locator = Locator(make_table(tube))
     assert locator.locate(report_of([angle_of(tube)])).simplified == ()
     counted = partial(_with_count, multiply, 2)
-    monkeypatch.setattr("rayfix_service.fusion.locator.multiply", counted)
+    monkeypatch.setattr("rayfix_service.fusion.fusion.multiply", counted)
     (said,) = locator.locate(report_of([angle_of(tube)])).simplified
     assert said.startswith("2 Gaussians were left out")
 

@@ -1,17 +1,9 @@
-"""The face of the fusion: a table and a report in, a fix out."""
-
-from dataclasses import dataclass
-
-import numpy as np
+"""Fuse the measurements of a report into the product of what they say of the position."""
 
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
-from rayfix_service.fusion.measurements.report import Angle, Range, Report
-from rayfix_service.fusion.posterior.credible import CredibleRegions
-from rayfix_service.fusion.posterior.fix import Fix
-from rayfix_service.fusion.posterior.fixes import Product, make_fix
-from rayfix_service.fusion.posterior.points import DrawnPoints
-from rayfix_service.fusion.posterior.posterior import Posterior, make_posterior
-from rayfix_service.fusion.product.beam import Hypotheses, multiply
+from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.posterior.fixes import Product
+from rayfix_service.fusion.product.beam import multiply
 from rayfix_service.fusion.product.cost import CostEstimate
 from rayfix_service.fusion.product.factors import Factor, make_factor
 from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_prior
@@ -40,26 +32,33 @@ _SINGULAR = (
 )
 
 
-class Locator:
-    """Answers reports from a table.
+class Fusion:
+    """Multiplies the measurements of reports, with what follows from a table and is worked out once.
 
     Parameters
     ----------
     table : Table
-    settings : FusionSettings, optional
+    settings : FusionSettings
     """
 
-    def __init__(self, table: Table, settings: FusionSettings | None = None) -> None:
+    def __init__(self, table: Table, settings: FusionSettings) -> None:
         self.table = table
-        self.settings = settings or FusionSettings()
+        self.settings = settings
         self._uniform_prior = uniform_prior(table.scene.free_space)
         self._stations = {name: StationMixtures(part) for name, part in table.parts.items()}
         largest = max((part.levels[-1].num_components for part in table.parts.values()), default=0)
         self._most_considered = max(self.settings.most_considered, self.settings.considered_tables * largest)
         self._cost = CostEstimate(self._stations, self.settings)
 
-    def locate(self, report: Report, *, stop: Stop = NEVER) -> Fix:
-        """Fuse the measurements of a report.
+    def seconds(self, report: Report) -> float:
+        """Estimate how long a fix of a report will take, s, within some microseconds.
+
+        It tells quick fixes from slow ones and is infinite for what is slow in any case.
+        """
+        return self._cost.seconds(report)
+
+    def product(self, report: Report, stop: Stop = NEVER) -> Product:
+        """Multiply what the measurements of a report say.
 
         Parameters
         ----------
@@ -74,57 +73,6 @@ class Locator:
         FixStoppedError
             When it was stopped.
         """
-        return make_fix(report, self._product(report, stop), self.table, self.settings, stop)
-
-    def fuse(self, report: Report, *, stop: Stop = NEVER) -> "Fused":
-        """Locate a report and keep what its fix was made of, for filters that go on with it.
-
-        Parameters
-        ----------
-        report : Report
-        stop : Stop
-            As of :meth:`locate`, and so are the errors.
-        """
-        product = self._product(report, stop)
-        fix = make_fix(report, product, self.table, self.settings, stop)
-        return Fused(fix=fix, hypotheses=product.hypotheses, prior=product.prior)
-
-    def posterior(self, report: Report, *, stop: Stop = NEVER) -> Posterior:
-        """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.
-
-        Parameters
-        ----------
-        report : Report
-        stop : Stop
-            As of :meth:`locate`, and so are the errors.
-        """
-        product = self._product(report, stop)
-        return make_posterior(product.hypotheses, product.prior, self.table.scene.free_space, stop)
-
-    def seconds(self, report: Report) -> float:
-        """Estimate how long a fix of a report will take, s, within some microseconds.
-
-        It tells quick fixes from slow ones and is infinite for what is slow in any case.
-        """
-        return self._cost.seconds(report)
-
-    def warm_up(self) -> None:
-        """Compile the kernels and prepare reports without angles, by locating a report of each kind."""
-        window = self.table.parts[self.table.site.stations[0].id].levels[0].window
-        for station in self.table.site.stations:
-            length = Range(station_id=station.id, path_length=5.0, stdev=0.5)
-            self.locate(Report(measurements=(length,)))
-            self.seconds(Report(measurements=(length,)))
-            for stdev in (0.5 * window, window):  # looked up in one cell and in several
-                angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=stdev, zenith_stdev=stdev)
-                self.locate(Report(measurements=(angle, length)))
-        points = DrawnPoints(mean=np.zeros((1, 3)), root=np.eye(3)[None], owner=np.zeros(8, np.int16))
-        regions = CredibleRegions(position=np.zeros(3), covariance=np.eye(3), points=points, share=1.0)
-        regions.upright_ellipsoid(0.5)
-        _ = regions.accuracies(0.5).ellipsoid.semi_axes
-
-    def _product(self, report: Report, stop: Stop) -> Product:
-        """Multiply what the measurements say."""
         sorted_report = sort_report(report, self.table.site)
         free_space = self.table.scene.free_space
         prior = self._uniform_prior if report.height is None else height_prior(report.height, free_space)
@@ -184,24 +132,3 @@ class Locator:
         if lost:
             unused |= {n: lost[n] for n in lost.keys() - {n for o in observations for n in o.differences}}
         return observations, factors
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fused:
-    """A fix, and the likelihood that it comes from.
-
-    The probability density of the report at a place x is ``sum_h exp(log_weight_h) N(x; mean_h, cov_h) / prior(x)``,
-    and ``exp(log_all_outlier)`` besides for the case that all measurements are outliers.
-
-    Attributes
-    ----------
-    fix : Fix
-    hypotheses : Hypotheses or None
-        Of the position, not yet cut to the free space; None where no measurement could be used.
-    prior : Prior
-        Of the position, with which the hypotheses' Gaussians are multiplied.
-    """
-
-    fix: Fix
-    hypotheses: Hypotheses | None
-    prior: Prior
