@@ -3,16 +3,37 @@
 The NumPy twins of some kernels are in ``reference.py``.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from rayfix_service.fusion.posterior.voxels import is_free_place, nearest_free
 from rayfix_tables.gaussians.cholesky import cholesky, invert, solve
 
 _SAME_MODE = 9.0
 """Two maxima nearer than this, squared and in what either is uncertain by, count as one mode."""
+
+
+class _Gaussians(NamedTuple):
+    """Gaussians with positive definite covariances.
+
+    Attributes
+    ----------
+    log_density : ndarray of shape (h,)
+        Log weight plus half the log determinant of the precision.
+    weight : ndarray of shape (h,)
+    mean : ndarray of shape (h, 3), m
+    cov : ndarray of shape (h, 3, 3), m2
+    precision : ndarray of shape (h, 3, 3), 1 / m2
+    """
+
+    log_density: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    cov: NDArray[np.float64]
+    precision: NDArray[np.float64]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -51,36 +72,14 @@ def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
             invert(lower, precision[h])
             log_density[h] = log_weight[h] - np.log(lower[0, 0] * lower[1, 1] * lower[2, 2])
     which = np.flatnonzero(definite)
-    return _modes(
-        log_density[which],
-        np.exp(log_weight[which]),
-        mean[which],
-        cov[which],
-        precision[which],
-        which,
-        len(log_weight),
-        origin,
-        voxel_size,
-        free,
-        stop,
-    )
+    definite_ones = _Gaussians(log_density[which], np.exp(log_weight[which]), mean[which], cov[which], precision[which])
+    return _modes(definite_ones, which, len(log_weight), origin, voxel_size, free, stop)
 
 
 @numba.njit(cache=True, nogil=True)
-def _modes(
-    log_density: Any,
-    weight: Any,
-    mean: Any,
-    cov: Any,
-    precision: Any,
-    which: Any,
-    total: Any,
-    origin: Any,
-    voxel_size: Any,
-    free: Any,
-    stop: Any,
-) -> Any:
+def _modes(gaussians: Any, which: Any, total: Any, origin: Any, voxel_size: Any, free: Any, stop: Any) -> Any:
     """Find the modes of Gaussians that are ``which`` of a ``total``; those left out count as the first mode's."""
+    log_density, weight, mean, cov, precision = gaussians
     count = len(weight)
     top, member = gather(log_density, mean, precision, _SAME_MODE, stop)
     probability, position = np.zeros(len(top)), np.zeros((len(top), 3))

@@ -73,19 +73,13 @@ def sum_up(
         When it was.
     """
     log_evidence, lost, modes, outlier, half_bad, drawn = _sum_up(
-        hypotheses.log_weight,
-        hypotheses.mean,
-        hypotheses.cov,
+        (hypotheses.log_weight, hypotheses.mean, hypotheses.cov),
         hypotheses.outlier,
         hypotheses.log_all_outlier,
-        outlier_index.rows,
-        len(outlier_index.places),
+        (outlier_index.rows, len(outlier_index.places)),
         math.log(floor),
-        unit_points(),
-        normal_points(_NUM_POINTS),
-        free_space.origin,
-        free_space.voxel_size,
-        free_space.free,
+        (unit_points(), normal_points(_NUM_POINTS)),
+        (free_space.origin, free_space.voxel_size, free_space.free),
         stop.cell,
     )
     stop.check()
@@ -97,22 +91,38 @@ def sum_up(
 
 @numba.njit(cache=True, nogil=True)
 def _sum_up(
-    log_weight: Any,
-    mean: Any,
-    cov: Any,
+    gaussians: Any,
     outlier: Any,
     log_all_outlier: Any,
-    rows: Any,
-    count: Any,
+    index: Any,
     log_floor: Any,
-    unit: Any,
-    normal: Any,
-    origin: Any,
-    voxel_size: Any,
-    free: Any,
+    points: Any,
+    space: Any,
     stop: Any,
 ) -> Any:
-    """Give the entries of a :class:`Summary`; ``unit`` and ``normal`` are points that stand for a standard normal."""
+    """Give the entries of a :class:`Summary`.
+
+    Parameters
+    ----------
+    gaussians : tuple
+        ``log_weight``, ``mean`` and ``cov`` of the hypotheses. Plain tuples, since it takes numba 4 us to find out what
+        a named one is.
+    outlier : ndarray of int8, shape (h, n)
+    log_all_outlier : float
+    index : tuple
+        ``rows`` of an :class:`OutlierIndex`, and the number of its measurements.
+    log_floor : float
+        Logarithm of the probability below which a hypothesis is left out of the modes.
+    points : tuple of 2 ndarrays
+        Points that stand for a standard normal: few for the cut, more for regions.
+    space : tuple
+        ``origin``, ``voxel_size`` and ``free`` of the free space.
+    stop : ndarray of uint8, shape (1,)
+    """
+    log_weight, mean, cov = gaussians
+    rows, count = index
+    unit, normal = points
+    origin, voxel_size, free = space
     log_cut, cut_mean, cut_cov = cut_to_free_space(log_weight, mean, cov, unit, origin, voxel_size, free)
     log_found = log_sum(log_cut)
     log_evidence = np.logaddexp(log_found, log_all_outlier)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.product.beam_kernels import multiply_factors
+from rayfix_service.fusion.product.beam_kernels import BeamLimits, FactorArrays, multiply_factors
 from rayfix_service.fusion.product.factors import Factor
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.stopping import NEVER, Stop
@@ -101,16 +101,10 @@ def multiply(
     outlier = np.concatenate([factor.outlier for factor in factors])
     offsets = np.array([0, *itertools.accumulate([len(factor) for factor in factors])])
     log_weight, mean, cov, outlier, log_all_outlier, omitted, dropped = multiply_factors(
-        columns,
-        outlier,
-        offsets,
-        prior.precision,
-        prior.eta,
-        prior.log_volume,
+        tuple(FactorArrays(columns, outlier, offsets)),
+        tuple(prior),
         math.log(max_path_length),
-        width,
-        max_divergence,
-        float(min(most_products, _MOST_PRODUCTS)),
+        tuple(BeamLimits(width, float(max_divergence), float(min(most_products, _MOST_PRODUCTS)))),
         stop.cell,
     )
     stop.check()

@@ -4,10 +4,11 @@
 columns.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from rayfix_service.fusion.product.information_form import add, dimension_of, invert_all, log_integrals
 from rayfix_service.fusion.product.merging import merge_hypotheses
@@ -21,41 +22,57 @@ _RANKED_AFTER = 26
 """Factors after which numbers of outlier patterns are ranked: 3**26 times a million hypotheses is below 2**63."""
 
 
-@numba.njit(cache=True, nogil=True)
-def multiply_factors(
-    alternatives: Any,
-    outlier: Any,
-    offsets: Any,
-    precision: Any,
-    eta: Any,
-    log_volume: Any,
-    log_range: Any,
-    width: Any,
-    max_divergence: Any,
-    most_products: Any,
-    stop: Any,
-) -> Any:
-    """Extend a beam by one factor after the other, merging hypotheses that mean the same.
+class FactorArrays(NamedTuple):
+    """Alternatives of all factors, one factor after the other.
 
-    Parameters
+    Attributes
     ----------
-    alternatives : ndarray of shape (rows, k)
-        Of all factors.
+    columns : ndarray of shape (rows, k)
+        As :mod:`rayfix_service.fusion.product.information_form` has them.
     outlier : ndarray of int8, shape (k,)
         What each takes for an outlier.
     offsets : ndarray of int64, shape (n + 1,)
         Alternatives of factor f are those from ``offsets[f]`` to ``offsets[f + 1]``.
         The last of them is that all of it is an outlier.
-    precision, eta, log_volume : float
-        As in :class:`~rayfix_service.fusion.product.prior.Prior`.
-    log_range : float
-        As in :func:`~rayfix_service.fusion.product.information_form.log_integrals`.
+    """
+
+    columns: NDArray[np.float64]
+    outlier: NDArray[np.int8]
+    offsets: NDArray[np.int64]
+
+
+class BeamLimits(NamedTuple):
+    """How far a beam goes.
+
+    Attributes
+    ----------
     width : int
         Products that are kept after each factor.
     max_divergence : float
         What a merge may cost, nats.
     most_products : float
-        Products that may be formed, in those of no clock. Each factor may take its share of what is left.
+        Products that may be formed, in those of no clock. Each factor may take its part of what is left.
+    """
+
+    width: int
+    max_divergence: float
+    most_products: float
+
+
+@numba.njit(cache=True, nogil=True)
+def multiply_factors(factors: Any, prior: Any, log_range: Any, limits: Any, stop: Any) -> Any:
+    """Extend a beam by one factor after the other, merging hypotheses that mean the same.
+
+    Parameters
+    ----------
+    factors : tuple
+        The fields of :class:`FactorArrays`. Plain tuples, since it takes numba 4 us to find out what a named one is.
+    prior : tuple
+        The fields of a ``Prior``.
+    log_range : float
+        As in :func:`~rayfix_service.fusion.product.information_form.log_integrals`.
+    limits : tuple
+        The fields of :class:`BeamLimits`.
     stop : ndarray of uint8, shape (1,)
         As in :class:`~rayfix_service.fusion.stopping.Stop`, looked at for each hypothesis.
 
@@ -74,7 +91,10 @@ def multiply_factors(
     dropped : int
         Products that were left out because rounding made their matrices singular.
     """
-    beam = _prior_column(dimension_of(alternatives), precision, eta, log_volume, log_range)
+    alternatives, outlier, offsets = factors
+    width, max_divergence, most_products = limits
+    log_volume = prior[0]
+    beam = _prior_column(dimension_of(alternatives), prior, log_range)
     chosen = np.zeros((1, len(offsets) - 1), np.int8)
     pattern = np.zeros(1, np.int64)
     score = np.zeros(1)
@@ -171,8 +191,9 @@ def _order(log_scale: Any, offsets: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _prior_column(dimension: Any, precision: Any, eta: Any, log_volume: Any, log_range: Any) -> Any:
+def _prior_column(dimension: Any, prior: Any, log_range: Any) -> Any:
     """Prior of position and clocks, shape (rows, 1); a clock lies evenly in a range of that logarithm."""
+    log_volume, precision, eta = prior
     column = np.zeros((triangle(dimension) + dimension + 1, 1))
     column[triangle(3) - 1] = precision
     column[triangle(dimension) + 2] = eta

@@ -14,7 +14,14 @@ from rayfix_service.fusion.measurements.likelihood import Term, product, total_v
 from rayfix_service.fusion.measurements.line_of_sight import line_of_sight_weights
 from rayfix_service.fusion.measurements.observations import Observation
 from rayfix_service.fusion.product.beam_kernels import product_costs
-from rayfix_service.fusion.product.factor_kernels import ALL_GOOD, PART, READING, TIME_OUTLIER, make_alternatives
+from rayfix_service.fusion.product.factor_kernels import (
+    ALL_GOOD,
+    PART,
+    READING,
+    TIME_OUTLIER,
+    AlternativeLimits,
+    make_alternatives,
+)
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.product.station_mixture import StationMixtures, join
 from rayfix_service.fusion.settings import FusionSettings
@@ -112,17 +119,19 @@ def make_factor(
     if num_clocks:
         most = int(most / math.sqrt(product_costs(3 + num_clocks)[0]))
     columns, outlier, omitted, dropped = make_alternatives(
-        *join(mixtures),
+        tuple(join(mixtures)),
         np.array(taken, PART),
         np.array(readings, READING),
         num_clocks,
-        prior.precision,
-        prior.eta,
-        prior.log_volume,
-        log_bad + log_any_time - _log_angle_range(observation),
-        math.log(settings.component_floor),
-        settings.max_divergence,
-        most,
+        tuple(prior),
+        tuple(
+            AlternativeLimits(
+                log_outlier=log_bad + log_any_time - _log_angle_range(observation),
+                log_floor=math.log(settings.component_floor),
+                max_divergence=float(settings.max_divergence),
+                most=most,
+            )
+        ),
         stop.cell,
     )
     stop.check()

@@ -6,7 +6,7 @@ it is that of the integral of the exponential over the free space, which a sum o
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,7 @@ _FARTHEST = 6.0
 """A height farther than this many standard deviations from all free space is a mistake."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Prior:
+class Prior(NamedTuple):
     """Prior density of the position.
 
     Attributes

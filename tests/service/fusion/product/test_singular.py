@@ -73,9 +73,9 @@ def test_a_singular_alternative_is_left_out_and_counted(readings: list[tuple[int
         part = np.array([(ALL_GOOD, 0, len(which), 0.0, 0.0, np.inf, 0.0, 0, len(readings))], PART)
         weights = np.log(np.array([0.3, 0.5, 0.2]))[which]
         times = np.array(readings, READING)
-        settings = (1, 0.0, 0.0, 5.0, -9.0, -20.0, 0.0, 100, NEVER.cell)
+        settings = (1, (5.0, 0.0, 0.0), (-9.0, -20.0, 0.0, 100), NEVER.cell)
         found: tuple[Array, NDArray[np.int8], int, int] = make_alternatives(
-            weights, mean[which], cov[which], part, times, *settings
+            (weights, mean[which], cov[which]), part, times, *settings
         )
         return found
 
