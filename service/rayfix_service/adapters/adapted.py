@@ -8,8 +8,9 @@ from pydantic import ValidationError
 from rayfix_service.fusion.measurements.report import Angle, Height, Measurement, Report, TimeOfArrival
 from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportError
 from rayfix_service.wire.documents import HeightDocument
-from rayfix_service.wire.problems import MAX_PROBLEMS, Path, path_text
+from rayfix_service.wire.problems import MAX_PROBLEMS
 from rayfix_tables.errors import ReportError
+from rayfix_tables.problems import Path, path_text
 
 
 @dataclass(frozen=True, kw_only=True)

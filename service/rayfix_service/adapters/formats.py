@@ -13,7 +13,7 @@ from rayfix_service.fusion.measurements.report import Height
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report
-from rayfix_service.wire.problems import path_text
+from rayfix_tables.problems import path_text
 from rayfix_tables.site import SiteInfo
 
 InputFormat = Literal["native", "nrppa", "silabs", "ublox"]

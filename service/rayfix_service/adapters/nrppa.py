@@ -28,8 +28,8 @@ from rayfix_service.adapters.nrppa_documents import (
 from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_interval, time_interval
 from rayfix_service.fusion.measurements.directions import to_scene
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, TimeOfArrival
-from rayfix_service.wire.problems import Path, path_text
 from rayfix_tables.angles import wrap_one
+from rayfix_tables.problems import Path, path_text
 from rayfix_tables.site import Station
 
 _RESOLUTION_M = {"m0dot1": 0.1, "mdot1": 0.1, "m1": 1.0, "m10": 10.0, "m30": 30.0}

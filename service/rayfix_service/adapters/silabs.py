@@ -15,8 +15,8 @@ from rayfix_service.adapters.documents import KnownHeight, Stations, TargetId, T
 from rayfix_service.fusion.measurements.report import Angle, Frame, Measurement, Range
 from rayfix_service.wire import MAX_MEASUREMENTS, WireModel
 from rayfix_service.wire.fields import misfit
-from rayfix_service.wire.problems import Path
 from rayfix_tables.angles import wrap_one
+from rayfix_tables.problems import Path
 
 _Stdev = Field(ge=0, le=360, description="a standard deviation in degrees, 0 to 360")
 

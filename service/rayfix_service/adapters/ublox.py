@@ -10,8 +10,8 @@ from rayfix_service.adapters.adapted import Adapted, Skipped, adapted_report, st
 from rayfix_service.adapters.transmissions import Joiner, Transmission
 from rayfix_service.fusion.measurements.report import Angle
 from rayfix_service.wire import MAX_REPORTS, FieldProblem, InvalidReportError
-from rayfix_service.wire.problems import Path, shown
 from rayfix_tables.angles import wrap_one
+from rayfix_tables.problems import Path, shown
 
 STDEV_DEG = 5.0
 """Anchors tell no uncertainty; this is taken for the standard deviation of their angles."""

@@ -10,9 +10,10 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
-from rayfix_service.wire import FieldProblem, MalformedJsonError, more_problems, path_text, problems_of
-from rayfix_service.wire.problems import MAX_PROBLEMS
+from rayfix_service.wire import FieldProblem, MalformedJsonError, more_problems, problems_of
+from rayfix_service.wire.problems import MAX_PROBLEMS, parameter_problem
 from rayfix_tables.errors import ReportError
+from rayfix_tables.problems import path_text
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -165,10 +166,7 @@ async def _answer_error(request: Request, error: Exception) -> JSONResponse:
 async def _answer_validation(request: Request, error: Exception) -> JSONResponse:
     """Answer a parameter that FastAPI itself refuses, such as one of a query."""
     assert isinstance(error, RequestValidationError | WebSocketRequestValidationError)
-    errors = [
-        FieldProblem(path=tuple(e["loc"][1:]), message=f"{path_text(tuple(e['loc'][1:]))}: {e['msg']}")
-        for e in error.errors()
-    ]
+    errors = [parameter_problem(detail) for detail in error.errors()]
     listed = errors[:MAX_PROBLEMS]
     return problem_response(problem_document(INVALID_PARAMETER, errors[0].message, listed, len(errors) - len(listed)))
 

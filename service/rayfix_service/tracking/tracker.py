@@ -13,6 +13,8 @@ import numpy as np
 from rayfix_service.fusion.posterior.credible import CredibleRegions
 from rayfix_service.fusion.posterior.fused import Fused
 from rayfix_service.fusion.posterior.points import ListedPoints
+from rayfix_service.fusion.product.beam import Hypotheses
+from rayfix_service.fusion.product.prior import uniform_prior
 from rayfix_service.measuring.timestamps import utc_moment
 from rayfix_service.tracking.estimate import estimate
 from rayfix_service.tracking.likelihood import likelihood_of
@@ -81,8 +83,26 @@ class Tracker:
         return len(self._tracks)
 
     def warm_up(self) -> None:
-        """Compile the kernels."""
+        """Compile the kernels, by a track of some particles that nobody sees."""
+        settings, free_space, rng = self.settings, self._walls.free_space, np.random.default_rng(0)
         self._walls.passable(np.zeros((1, 3)), np.zeros((1, 3)))
+        free = np.argwhere(free_space.free)
+        if not len(free):
+            return
+        hypotheses = Hypotheses(
+            log_weight=np.zeros(1),
+            mean=free_space.origin + free_space.voxel_size * (free[:1] + 0.5),
+            cov=(0.1 * free_space.voxel_size) ** 2 * np.eye(3)[None],
+            outlier=np.zeros((1, 1), np.int8),
+            log_all_outlier=-50.0,
+        )
+        particles = birth(hypotheses, free_space, settings.motion, 64, rng)
+        assert particles is not None
+        likelihood = likelihood_of(hypotheses, uniform_prior(free_space), height_share=1.0)
+        updated = update(particles, likelihood, settings.motion, 0.1, self._walls, rng)
+        position = _told("started", "1970-01-01T00:00:00Z", 1, particles if updated is None else updated.particles)
+        position.regions.upright_ellipsoid(0.5)
+        _ = position.regions.accuracies(0.5).ellipsoid.semi_axes
 
     def follow(self, fused: Fused) -> TrackedPosition | None:
         """Take a report into its target's track, and tell where the target is.

@@ -9,16 +9,14 @@ from rayfix_service.fusion.posterior.posterior import Posterior
 from rayfix_service.web.inspector import DirectionView
 from rayfix_service.web.simulation import SimulatedPath
 from rayfix_service.wire import (
-    FieldProblem,
     FixDocument,
-    InvalidReportError,
     Point,
     ReportDocument,
     WireModel,
-    path_text,
     read_json,
 )
 from rayfix_service.wire.points import Matrix
+from rayfix_service.wire.problems import invalid_report
 
 
 class ViewerSettings(BaseModel):
@@ -151,13 +149,7 @@ def parse_simulation(body: bytes) -> SimulationRequest:
     try:
         return SimulationRequest.model_validate(data)
     except ValidationError as error:
-        problems = []
-        for detail in error.errors(include_url=False):
-            field = SimulationRequest.model_fields.get(str(detail["loc"][0]) if detail["loc"] else "")
-            hint = f"; give {field.description}" if field is not None and field.description else ""
-            name = path_text(detail["loc"]) or "the document"
-            problems.append(FieldProblem(path=detail["loc"], message=f"{name}: {detail['msg']}{hint}"))
-        raise InvalidReportError(tuple(problems)) from None
+        raise invalid_report(error, SimulationRequest, data, "the document") from None
 
 
 def mixture_document(station_id: str, view: DirectionView, *, most_cells: int = 64) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from rayfix_service.wire.problems import (
     InvalidReportError,
     MalformedJsonError,
     invalid_report,
-    report_problem_of,
 )
 
 _SHORT = 16 << 10
@@ -89,4 +88,4 @@ def _validate(data: object, most_problems: int) -> ReportDocument:
     try:
         return ReportDocument.model_validate(document)
     except ValidationError as error:
-        raise invalid_report(error, ReportDocument, document, report_problem_of, most_problems) from None
+        raise invalid_report(error, ReportDocument, document, "the report", most_problems) from None

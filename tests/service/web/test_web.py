@@ -3,7 +3,7 @@
 import asyncio
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -315,3 +315,46 @@ def test_results_of_tables_are_computed_once():
         return [calls.count(name) for name in "abc"]
 
     assert asyncio.run(ask()) == [2, 1, 1]  # "a" was the oldest when "c" came
+
+
+def test_requests_at_the_same_time_wait_for_one_result():
+    async def ask() -> tuple[list[object], list[str]]:
+        kept, calls, may_end = TableCache(), list[str](), asyncio.Event()
+
+        async def run(compute: Callable[[], str]) -> str:
+            calls.append("a")
+            await may_end.wait()
+            return compute()
+
+        tasks = [asyncio.create_task(kept.get("table", "a", lambda: "result", run)) for _ in range(4)]
+        await asyncio.sleep(0)
+        tasks[0].cancel()  # the client that came first is gone; the others get their result
+        await asyncio.sleep(0)
+        may_end.set()
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+        assert await kept.get("table", "a", lambda: "another", run) == "result"
+        return results, calls
+
+    (gone, *results), calls = asyncio.run(ask())
+    assert isinstance(gone, asyncio.CancelledError)
+    assert results == ["result"] * 3
+    assert calls == ["a"]
+
+
+def test_a_failed_result_is_computed_anew():
+    async def ask() -> tuple[list[object], str]:
+        kept, failures = TableCache(), [ValueError("once")]
+
+        async def run(compute: Callable[[], str]) -> str:
+            await asyncio.sleep(0)
+            if failures:
+                raise failures.pop()
+            return compute()
+
+        both = [kept.get("table", "a", lambda: "result", run) for _ in range(2)]
+        failed = await asyncio.gather(*both, return_exceptions=True)
+        return failed, await kept.get("table", "a", lambda: "result", run)
+
+    failed, result = asyncio.run(ask())
+    assert [str(error) for error in failed] == ["once", "once"]
+    assert result == "result"

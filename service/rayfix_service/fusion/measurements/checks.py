@@ -17,6 +17,7 @@ from rayfix_service.fusion.measurements.report import (
 )
 from rayfix_tables.errors import ReportError
 from rayfix_tables.limits import Limits
+from rayfix_tables.problems import path_text
 
 _FINITE = Limits()
 _STDEV = Limits(above=0.0)
@@ -107,5 +108,4 @@ def _check(part: object, path: tuple[str | int, ...]) -> None:
 
 
 def _refuse(path: tuple[str | int, ...], value: object, wanted: str) -> None:
-    text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).removeprefix(".")
-    raise ReportError(f"{text} is {value!r}; give {wanted}", path=path)
+    raise ReportError(f"{path_text(path)} is {value!r}; give {wanted}", path=path)
