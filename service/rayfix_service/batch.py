@@ -1,7 +1,7 @@
 """Many reports in one call, on several processor cores.
 
 A third of a fix is Python, which one thread of a process runs at a time, so that threads gain little; processes do.
-Each maps the table's file, which they therefore share in memory.
+Each maps the table's file, so that the table is in memory once.
 """
 
 import pickle

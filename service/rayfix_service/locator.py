@@ -118,7 +118,7 @@ class Locator:
     def seconds(self, report: Report) -> float:
         """Estimate how long a fix of a report will take, s, within some microseconds.
 
-        It tells quick fixes from slow ones and is infinite for what is slow in any case.
+        The estimate separates quick fixes from slow ones; it is infinite for a report that is slow in any case.
         """
         return self._fusion.seconds(report)
 

@@ -79,7 +79,7 @@ def adapted_report(
     repeated: list[Skipped] = []
     for path, measurement in measurements:
         if isinstance(measurement, Angle | TimeOfArrival) and measurement in first:
-            repeated.append(Skipped(path=path, reason=f"says the same as {path_text(first[measurement])}"))
+            repeated.append(Skipped(path=path, reason=f"repeats {path_text(first[measurement])}"))
             continue
         first.setdefault(measurement, path)
         kept.append((path, measurement))
@@ -91,12 +91,12 @@ def adapted_report(
 
 
 def station_of(name: str, *maps: Mapping[str, str] | None) -> str:
-    """Return the station that another system calls `name`: what the first map with it says, else the name itself."""
+    """Return the station that another system calls `name`: by the first map that has it, else the name itself."""
     return next((stations[name] for stations in maps if stations and name in stations), name)
 
 
 def with_height(adapted: Adapted, height: Height | None) -> Adapted:
-    """Add what is known of the target's height to a report that says nothing of it."""
+    """Add the known height of the target to a report without one."""
     if height is None or adapted.report.height is not None:
         return adapted
     return replace(adapted, report=replace(adapted.report, height=height))
@@ -108,7 +108,7 @@ def error_in_message(error: ReportError, adapted: Adapted) -> InvalidReportError
     if len(error.path) > 1 and error.path[0] == "measurements" and isinstance(error.path[1], int):
         source = adapted.sources[error.path[1]]
     unknown = bool(error.path) and error.path[-1] in ("station_id", "reference_station_id")
-    remedy = "; say with stations which one is meant" if unknown else ""
+    remedy = "; give the station in the map stations" if unknown else ""
     text = f"{path_text(source)}: {error}{remedy}" if source else str(error)
     return InvalidReportError((FieldProblem(path=source, message=text),))
 

@@ -27,7 +27,7 @@ def parse(
     stations: Mapping[str, str] | None = None,
     height: Height | None = None,
 ) -> tuple[Adapted, ...]:
-    """Turn a message into reports: one, or for u-blox lines as many as they tell of.
+    """Turn a message into reports: one, or for u-blox lines one for each transmission.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def parse(
     stations : Mapping, optional
         Stations by the names that the message has for them; the native format has the stations' own.
     height : Height, optional
-        What is known of the target's height, for messages that say nothing of it.
+        Known height of the target, for messages without one.
 
     Raises
     ------

@@ -69,7 +69,7 @@ class MqttSettings:
     track : bool
         Whether tags are followed from packet to packet.
     hub : HubSettings or None
-        Omlox hub that is told of all positions as well.
+        Omlox hub that all positions are sent to as well.
     """
 
     topic: str = "silabs/aoa/angle/+/+"
@@ -180,22 +180,22 @@ async def run_mqtt(
 
 async def _run_session(session: "_Session", broker: Broker, on_ready: Callable[[], None] | None) -> None:
     """Connect, and again when the connection is lost."""
-    place, topic = f"{broker.host}:{broker.port}", session.settings.topic
+    address, topic = f"{broker.host}:{broker.port}", session.settings.topic
     connected, pause = False, 1.0
     while True:
         try:
             async with _client(broker) as client:
                 await client.subscribe(topic)
                 connected, pause = True, 1.0
-                _log.info("reading '%s' from %s", topic, place)
+                _log.info("reading '%s' from %s", topic, address)
                 if on_ready is not None:
                     on_ready()
                 await _first_of(session.read(client), session.watch(client))
         except (aiomqtt.MqttError, OSError, ValueError) as error:  # ValueError: of a topic that is none
             if not connected:
-                text = f"cannot use the MQTT broker {place} ({error}); check its address and your rights"
+                text = f"cannot use the MQTT broker {address} ({error}); check its address and your rights"
                 raise BrokerError(text) from error
-            _log.warning("lost the broker %s (%s), trying again in %g s", place, in_log(str(error), most=1000), pause)
+            _log.warning("lost the broker %s (%s), trying again in %g s", address, in_log(str(error), most=1000), pause)
         await asyncio.sleep(pause)
         pause = min(2.0 * pause, _LONGEST_PAUSE)
 
@@ -257,7 +257,7 @@ class _Session:
             return []
 
     async def watch(self, client: aiomqtt.Client) -> None:
-        """End packets that not all locators have heard."""
+        """Complete packets that not all locators have received."""
         while True:
             await asyncio.sleep(0.1 * self.settings.window)
             await self._publish(client, self.stream.due(monotonic()))
@@ -283,7 +283,7 @@ class _Session:
                 _log.error("a position of '%s' cannot be published: %s", target, error)
 
     def _answer(self, adapted: Adapted) -> dict[str, Any]:
-        """Locate a packet, go on with its tag's track, and tell the hub."""
+        """Locate a packet, update its tag's track, and send the position to the hub."""
         begin = perf_counter()
         fused = self.locator.fuse(adapted.report)
         seconds = perf_counter() - begin

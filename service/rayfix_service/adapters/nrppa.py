@@ -138,7 +138,7 @@ def _array(value: object) -> list[Any] | tuple[Any, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Converter:
-    """Conversion of one TRP's measurements: pairs of a place within the item, and a measurement or a reason."""
+    """Conversion of one TRP's measurements: pairs of a path within the item, and a measurement or a reason."""
 
     document: NrppaDocument
     station_id: str
@@ -241,7 +241,7 @@ def _additional_paths(path: Path, value: UlRtoa | GnbRxTx) -> Iterator[tuple[Pat
 
 
 def _with_line_of_sight(measurement: Angle | Range | TimeOfArrival, los: LosInformation | None) -> Measurement:
-    """Add what the TRP says of a direct path; a hard indicator is a sure one."""
+    """Add the TRP's line-of-sight indicator; a hard one is a probability of 0 or 1."""
     if los is None:
         return measurement
     name, value = one_of(los)

@@ -26,7 +26,7 @@ from rayfix_tables.site import SiteInfo
 _log = logging.getLogger(__name__)
 
 HubOutcome = Literal["sent", "refused", "dropped"]
-"""What became of a location: the hub took it, said that it never will, or there was no room or patience left."""
+"""Outcome of a location: the hub accepted or refused it, or it was dropped since the queue or the time was used up."""
 
 MAX_ANSWER = 4096
 """Bytes of a hub's answer that are read, for the sake of the connection; nothing of them is used."""
@@ -41,7 +41,7 @@ class HubError(RayfixError):
 
 @dataclass(frozen=True, kw_only=True)
 class HubSettings:
-    """Where the hub is and how patiently it is told.
+    """Address of the hub, and how long sending is attempted.
 
     Attributes
     ----------

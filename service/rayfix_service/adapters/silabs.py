@@ -1,6 +1,6 @@
 """From the angles of Silicon Labs' Bluetooth locators to a report.
 
-A locator publishes one JSON object per packet that it heard (Bluetooth SDK, ``aoa_serialize_angle``): degrees and
+A locator publishes one JSON object per packet that it received (Bluetooth SDK, ``aoa_serialize_angle``): degrees and
 metres, with the sequence number of the packet. Locator and tag are named by the MQTT topic alone.
 """
 

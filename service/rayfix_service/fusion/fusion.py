@@ -1,4 +1,4 @@
-"""Fuse the measurements of a report into the product of what they say of the position."""
+"""Fuse the measurements of a report: the product of their likelihoods and of the prior."""
 
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
 from rayfix_service.fusion.measurements.report import Report
@@ -53,12 +53,12 @@ class Fusion:
     def seconds(self, report: Report) -> float:
         """Estimate how long a fix of a report will take, s, within some microseconds.
 
-        It tells quick fixes from slow ones and is infinite for what is slow in any case.
+        The estimate separates quick fixes from slow ones; it is infinite for a report that is slow in any case.
         """
         return self._cost.seconds(report)
 
     def product(self, report: Report, stop: Stop = NEVER) -> Product:
-        """Multiply what the measurements of a report say.
+        """Multiply the likelihoods of the measurements of a report.
 
         Parameters
         ----------
@@ -103,9 +103,9 @@ class Fusion:
     ) -> tuple[list[Observation], list[Factor]]:
         """Factors of the observations that can contribute; why others cannot goes to ``unused``."""
         observations, factors = [], []
-        lost: dict[int, str] = {}
+        unused_differences: dict[int, str] = {}
         left, count = self._most_considered, len(sorted_report.observations)
-        for place, observation in enumerate(sorted_report.observations):
+        for index, observation in enumerate(sorted_report.observations):
             factor = None
             if left > 0:
                 factor = make_factor(
@@ -115,7 +115,7 @@ class Fusion:
                     max_path_length=self.table.site.max_path_length,
                     prior=prior,
                     settings=self.settings,
-                    most_considered=left // (count - place),
+                    most_considered=left // (count - index),
                     stop=stop,
                 )
             if factor is not None:
@@ -124,11 +124,12 @@ class Fusion:
                 factors.append(factor)
                 continue
             reason = _NO_RAYS.format(observation.station_id) if left > 0 else _TOO_MUCH
-            for index in (observation.angle_index, *observation.timing_indices):
-                if index is not None:
-                    unused[index] = reason
-            lost |= dict.fromkeys(observation.differences, reason)
-        # A time difference is of two paths, and says something as long as one of them does.
-        if lost:
-            unused |= {n: lost[n] for n in lost.keys() - {n for o in observations for n in o.differences}}
+            for measured in (observation.angle_index, *observation.timing_indices):
+                if measured is not None:
+                    unused[measured] = reason
+            unused_differences |= dict.fromkeys(observation.differences, reason)
+        # A time difference belongs to two paths, and contributes as long as one of them does.
+        if unused_differences:
+            contributing = {n for o in observations for n in o.differences}
+            unused |= {n: unused_differences[n] for n in unused_differences.keys() - contributing}
         return observations, factors

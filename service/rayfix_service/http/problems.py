@@ -134,7 +134,7 @@ def report_problem(error: ReportError) -> dict[str, Any]:
 
 
 def internal_problem() -> dict[str, Any]:
-    """Build the document of a defect. It says nothing of the cause, which the log has."""
+    """Build the document of a defect. The cause is in the log only."""
     return problem_document(
         INTERNAL_ERROR, "this is a defect of the service, not of the request; its log has the cause"
     )
@@ -152,7 +152,7 @@ def problem_responses(*kinds: ProblemKind) -> dict[int | str, dict[str, Any]]:
 
 
 def error_response(error: ProblemError | ReportError) -> JSONResponse:
-    """Answer with the problem that an error tells of."""
+    """Answer with the problem document of an error."""
     if isinstance(error, ProblemError):
         return problem_response(problem_document(error.kind, str(error), error.errors), error.headers)
     return problem_response(report_problem(error))

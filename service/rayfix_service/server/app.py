@@ -117,7 +117,7 @@ def create_app(
     at_hand : dict of str to ServedTable, optional
         Tables that are verified already, by name; they answer at once. The application takes them out.
     accounts : Accounts, optional
-        Of the clients' rates, which several processes may share.
+        Of the clients' rates, which may be common to several processes.
 
     Raises
     ------

@@ -25,7 +25,7 @@ _SMALL_REST = 1 << 16  # bytes of a body that nobody reads, for which it does no
 _LINGER_SECONDS = 2.0  # for a client that still sends, or that has not read all, when its connection ends
 _LINGER_BYTES = 32 << 20
 _SPARE_SECONDS = 1.0  # for the head of a request, when there are too many connections
-_STOP_SECONDS = 3.0  # for what is under way, when the process is told to end
+_STOP_SECONDS = 3.0  # for requests under way, when the process is to end
 
 # Of the library that reads web sockets.
 _WEBSOCKET_LINE = 8000
@@ -233,7 +233,7 @@ class GatheringProtocol(HttpToolsProtocol):
         return bool(lengths) and lengths[0].isdigit() and int(lengths[0]) <= _SMALL_REST
 
     def _close_after_early_answer(self) -> None:
-        """Have an answer that comes before the end of the body say that the connection ends, and end it."""
+        """Announce in an answer before the end of the body that the connection ends, and end it."""
         cycle, send = self.cycle, self.cycle.send
 
         async def send_and_close(message: Any) -> None:
@@ -304,7 +304,7 @@ class GatheringProtocol(HttpToolsProtocol):
         return cycle is not None and not cycle.response_complete
 
     def _last_cycle(self) -> RequestResponseCycle | None:
-        return self.cycle  # None before the first request, which its type does not say
+        return self.cycle  # None before the first request, unlike its type
 
     # --- refusals
 

@@ -1,6 +1,6 @@
-"""What a report says of the position, apart from what was known before: for multiplying with a track.
+"""The likelihood of the position given a report, without the prior: for multiplying with a track.
 
-A fix is the product of the measurements and of a prior, even in the free space. A track has a prior of its own, its
+A fix is the product of the likelihood and of a prior, uniform over the free space. A track has a prior of its own, its
 prediction, so the fix's is divided out: else the free space, and a known height, would count anew with each report.
 """
 
@@ -29,7 +29,7 @@ class Likelihood:
     mean : ndarray of shape (h, 3), m
     slope : ndarray of shape (h, 3), 1 / m
     information : ndarray of shape (h, 3, 3), 1 / m2
-        May be singular: an azimuth alone says nothing of the height.
+        May be singular: an azimuth alone does not constrain the height.
     dropped : int
         Hypotheses that were left out because their covariances are not positive definite.
     """
@@ -67,8 +67,8 @@ def likelihood_of(hypotheses: Hypotheses, prior: Prior, *, height_share: float) 
     prior : Prior
         That they were multiplied with.
     height_share : float
-        Share of what is known of the height that is left in, 0 to 1. All reports of a target tell the same of its
-        height, so that no more than one of them may count in full; see ``TrackingSettings.height_seconds``.
+        Fraction, 0 to 1, of the known height's information that is kept. All reports of a target carry the same height,
+        so that no more than one of them may count in full; see ``TrackingSettings.height_seconds``.
     """
     taken = (1.0 - height_share) * prior.precision
     information, definite = inverses(hypotheses.cov)

@@ -74,7 +74,7 @@ class Updated:
 def birth(
     hypotheses: Hypotheses, free_space: FreeSpace, model: MotionModel, count: int, rng: np.random.Generator
 ) -> Particles | None:
-    """Draw particles from a report alone; None where all it says lies in solids.
+    """Draw particles from a report alone; None where all of its hypotheses lie in solids.
 
     A hypothesis whose covariance is not positive definite has no weight; None, too, where there is no other.
     """
@@ -163,10 +163,10 @@ def update(
 
 
 def mixed(track: Particles, newborn: Particles, share: float, rng: np.random.Generator) -> Particles:
-    """Replace a share of a track's particles by newborn ones; with all of them, it is a new track.
+    """Replace a fraction of a track's particles by newborn ones; if all are replaced, it is a new track.
 
-    A Gaussian over the velocity is a mixture of narrower ones, so the newborn get velocities drawn from their own and
-    then share the track's variance.
+    A Gaussian over the velocity is a mixture of narrower ones, so the newborn ones get velocities drawn from their own
+    Gaussians and then the track's variance.
     """
     count = len(track)
     num_new = math.floor(share * count + rng.random())
@@ -239,7 +239,7 @@ def _free_ways(
     Parameters
     ----------
     draw : callable
-        Told how many are free so far, draws the origins and ends of as many ways as there are particles.
+        Takes the number of free ways so far and draws the origins and ends of as many ways as there are particles.
     """
     count = len(particles)
     origins, ends, tried = np.empty(0, np.int64), np.empty((0, 3)), 0
@@ -268,8 +268,8 @@ def _moved(particles: Particles, step: Step, ways: _Ways, middle: Array) -> Part
 def _systematic(weight: Array, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Draw indices by weight with one random number (systematic resampling: J. Carpenter et al., 1999)."""
     reached = np.cumsum(weight)
-    places = (np.arange(count) + rng.random()) * (reached[-1] / count)
-    return np.asarray(np.minimum(np.searchsorted(reached, places, side="right"), len(weight) - 1))
+    levels = (np.arange(count) + rng.random()) * (reached[-1] / count)
+    return np.asarray(np.minimum(np.searchsorted(reached, levels, side="right"), len(weight) - 1))
 
 
 def _exactly(found: NDArray[_T], count: int, rng: np.random.Generator) -> NDArray[_T]:

@@ -1,4 +1,4 @@
-"""All targets that are followed, and what becomes of a report whose time does not fit."""
+"""The tracks of all targets, and reports whose times are out of order."""
 
 import hashlib
 import math
@@ -38,7 +38,7 @@ class _Track:
     seconds : float
         Time of ``position``, since 1970.
     touched : float, s
-        When the target was last heard of, by the service's clock.
+        Time of the target's last report, by the service's clock.
     strange : float or None
         Time of the last report, if it was long before the track.
     """
@@ -52,7 +52,9 @@ class _Track:
 
 
 class Tracker:
-    """Follows targets from report to report through one building; see docs/tracking.md. Threads may share it.
+    """Follows targets from report to report through one building; it may be used from several threads.
+
+    docs/tracking.md describes the filter.
 
     Parameters
     ----------
@@ -75,7 +77,7 @@ class Tracker:
         self._walls = walls_of(table.scene if isinstance(table, Table) else table)
         self.dropped = 0
         self._clock = clock
-        self._tracks: OrderedDict[str, _Track] = OrderedDict()  # the one heard of last comes last
+        self._tracks: OrderedDict[str, _Track] = OrderedDict()  # the one with the latest report comes last
         self._lock = Lock()
 
     def __len__(self) -> int:
@@ -100,17 +102,17 @@ class Tracker:
         assert particles is not None
         likelihood = likelihood_of(hypotheses, uniform_prior(free_space), height_share=1.0)
         updated = update(particles, likelihood, settings.motion, 0.1, self._walls, rng)
-        position = _told("started", "1970-01-01T00:00:00Z", 1, particles if updated is None else updated.particles)
+        position = _tracked("started", "1970-01-01T00:00:00Z", 1, particles if updated is None else updated.particles)
         position.regions.upright_ellipsoid(0.5)
         _ = position.regions.accuracies(0.5).ellipsoid.semi_axes
 
     def follow(self, fused: Fused) -> TrackedPosition | None:
-        """Take a report into its target's track, and tell where the target is.
+        """Update a target's track with a report, and return its position.
 
         Returns
         -------
         TrackedPosition or None
-            None as long as no report has said anything of the position.
+            None as long as no report has constrained the position.
 
         Raises
         ------
@@ -137,7 +139,7 @@ class Tracker:
             return track.position
 
     def _forget(self, now: float) -> None:
-        """Forget targets not heard of for long."""
+        """Forget targets without a report for long."""
         while self._tracks and now - next(iter(self._tracks.values())).touched > self.settings.max_age:
             self._tracks.popitem(last=False)
 
@@ -151,7 +153,7 @@ class Tracker:
         gap = seconds - track.seconds
         if gap <= 0.0:
             # A report that is repeated, or was overtaken. Long before the track, it may be the first after the clock
-            # was set back: the second says so.
+            # was set back, which the second one confirms.
             long_before = gap < -self.settings.longest_gap
             if long_before and track.strange is not None and 0.0 < seconds - track.strange < self.settings.longest_gap:
                 return self._start("restarted", timestamp, seconds, fused, now, track.rng)
@@ -167,7 +169,7 @@ class Tracker:
         particles = self._newborn(fused, rng)
         if particles is None:
             return None
-        position = _told(state, timestamp, 1, particles)
+        position = _tracked(state, timestamp, 1, particles)
         return _Track(particles=particles, position=position, seconds=seconds, touched=now, rng=rng)
 
     def _newborn(self, fused: Fused, rng: np.random.Generator) -> Particles | None:
@@ -182,7 +184,7 @@ class Tracker:
         num_steps = math.ceil(gap / settings.longest_step)
         step = gap / num_steps
         particles: Particles | None = track.particles
-        # The last step is the report's, where it says anything.
+        # The last step is the update, where the report constrains the position.
         for _ in range(num_steps - 1 if fused.hypotheses else num_steps):
             if particles is not None:
                 particles = predict(particles, settings.motion, step, self._walls, rng)
@@ -191,8 +193,8 @@ class Tracker:
             particles, state = self._take_in(particles, fused, step, min(1.0, gap / settings.height_seconds), rng)
         if particles is None:
             return None
-        told = 1 if state == "restarted" else track.position.num_reports + (state == "updated")
-        position = _told(state, timestamp, told, particles)
+        num_reports = 1 if state == "restarted" else track.position.num_reports + (state == "updated")
+        position = _tracked(state, timestamp, num_reports, particles)
         return _Track(particles=particles, position=position, seconds=track.seconds + gap, touched=now, rng=rng)
 
     def _take_in(
@@ -220,7 +222,7 @@ class Tracker:
         return 1.0 / (1.0 + math.exp(min(-log_ratio - math.log(odds), 700.0)))
 
 
-def _told(state: TrackState, timestamp: str, num_reports: int, particles: Particles) -> TrackedPosition:
+def _tracked(state: TrackState, timestamp: str, num_reports: int, particles: Particles) -> TrackedPosition:
     found = estimate(particles)
     return TrackedPosition(
         state=state,

@@ -38,8 +38,8 @@ class CellSummary(BaseModel):
 class ComponentSummary(BaseModel):
     """A component after it was conditioned on the direction."""
 
-    probability: float = Field(description="share of the direction's mixture")
-    log_weight: float = Field(description="natural logarithm of that share")
+    probability: float = Field(description="fraction of the direction's mixture")
+    log_weight: float = Field(description="natural logarithm of that fraction")
     position: Point = Field(description="mean")
     covariance_m2: Matrix
     path_length_m: float
@@ -48,7 +48,7 @@ class ComponentSummary(BaseModel):
 
 
 class MixtureDocument(BaseModel):
-    """What the table says of one direction."""
+    """The mixture of one direction."""
 
     station_id: str
     in_field_of_view: bool
@@ -70,14 +70,14 @@ class LevelCoverage(BaseModel):
     window_deg: float
     num_cells: int
     num_filled_cells: int
-    mass_by_reflections: list[float] = Field(description="share of the level's mass with 0, 1, ... reflections")
+    mass_by_reflections: list[float] = Field(description="fraction of the level's mass with 0, 1, ... reflections")
 
 
 class CoverageDocument(BaseModel):
     """How far the paths of a station reach."""
 
     station_id: str
-    coverage: list[float] = Field(description="share of the free space that at most 0, 1, ... reflections reach")
+    coverage: list[float] = Field(description="fraction of the free space that at most 0, 1, ... reflections reach")
     levels: list[LevelCoverage] = Field(description="finest first")
 
 
@@ -101,7 +101,7 @@ class SimulationRequest(WireModel):
 
 
 class PathSummary(BaseModel):
-    """The path that a station was taken to hear."""
+    """The path that a station was taken to report."""
 
     station_id: str
     azimuth_deg: float
@@ -131,7 +131,7 @@ class PosteriorDocument(BaseModel):
 
     gaussians: list[GaussianSummary] = Field(description="the most probable ones before they are cut to the free space")
     num_gaussians: int
-    prior_share: float = Field(description="probability that the report says nothing of the position")
+    prior_share: float = Field(description="probability that the report does not constrain the position")
     samples: list[Annotated[list[float], Field(min_length=3, max_length=3)]] = Field(
         description="positions drawn from the posterior, m"
     )

@@ -1,7 +1,7 @@
 """The JSON of the HTTP interface, and its way to a report and back from a fix.
 
-On the wire an angle is in degrees, a length in metres and a delay in nanoseconds, and each name says so.
-Inside, everything is SI and radians. This package is the only place where the one becomes the other.
+On the wire an angle is in degrees, a length in metres and a delay in nanoseconds, and each name has its unit.
+Inside, everything is SI and radians. Only this package converts between them.
 """
 
 from rayfix_service.wire.documents import (

@@ -74,7 +74,7 @@ class _WithErrorModel(WireModel):
 
 
 class _OfOnePath(_WithErrorModel):
-    """Measurement of which the receiver may tell whether the path is direct."""
+    """Measurement that may carry a line-of-sight indication."""
 
     los_probability: LosProbability | None = None
 
@@ -214,7 +214,7 @@ _LONGEST = 1e6
 
 
 class TimeOfArrivalDocument(_OfOnePath):
-    """A time of arrival, with an unknown clock offset that all of a report's times of arrival share."""
+    """A time of arrival, with an unknown clock offset that is common to all times of arrival of a report."""
 
     model_config = ConfigDict(title="TimeOfArrival", json_schema_extra=_ARRIVAL_FORMS.schema)
 

@@ -1,4 +1,4 @@
-"""Names are data: one way for each place that a name of a target, station or locator is written to.
+"""Names are data: one way to write a name of a target, station or locator for each kind of output.
 
 A name may hold any character: it comes from a client, a broker or a site file.
 """

@@ -112,7 +112,7 @@ def invalid_report(
         except ValidationError as fewer:
             error = fewer
     details = error.errors(include_url=False)[:MAX_PROBLEMS]
-    # A misspelt key comes with a missing one; the first message should be the one that says so.
+    # A misspelt key comes with a missing one; the first message should name the misspelt one.
     details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
     problems = tuple(problem_of(model, detail, what) for detail in details[:most])
     return InvalidReportError(problems, found - len(problems))

@@ -23,10 +23,10 @@ _SHORT = 16 << 10
 
 
 def read_json(body: bytes) -> object:
-    """Parse a JSON text; a byte order mark before it, as some editors write one, is passed over.
+    """Parse a JSON text; a byte order mark before it, as some editors write one, is skipped.
 
     The literals NaN and Infinity and numbers like 1e400 become floats that are not finite: the model then
-    refuses them at their place, which helps more than "malformed" would.
+    refuses them with their path, which helps more than "malformed" would.
 
     Raises
     ------

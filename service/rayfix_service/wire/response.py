@@ -11,7 +11,7 @@ from rayfix_service.wire.track import TrackDocument, track_to_document
 
 
 class CandidateDocument(BaseModel):
-    """One place where the target may be."""
+    """One position that the target may have."""
 
     model_config = ConfigDict(title="Candidate")
 

@@ -1,6 +1,6 @@
 """What comes out of a fix, in SI units.
 
-The JSON of the HTTP interface is another matter: :mod:`rayfix_service.wire` writes it.
+The JSON of the HTTP interface is written by :mod:`rayfix_service.wire`.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ Status = Literal["ok", "ambiguous", "inconsistent", "insufficient"]
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """One place where the UE may be.
+    """One position that the UE may have.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Outcome:
     Attributes
     ----------
     used : bool
-        False for a measurement that could not contribute; ``reason`` then says why.
+        False for a measurement that could not contribute; ``reason`` then gives the cause.
     outlier_probability : float or None
         Posterior probability that this measurement has nothing to do with the position; None when not used.
     """

@@ -1,4 +1,4 @@
-"""Sum the hypotheses of a report up in a fix."""
+"""Summarise the hypotheses of a report in a fix."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.table import Table
 
 _LEAST_CANDIDATE = 1e-3
-"""Candidates less probable than this are not told."""
+"""Candidates less probable than this are left out of the fix."""
 
 
 class Product(NamedTuple):
@@ -28,7 +28,7 @@ class Product(NamedTuple):
     observations : list of Observation
         Those that contribute.
     unused : dict of int to str
-        Why measurements do not, by their places in the report.
+        Why measurements do not, by their indices in the report.
     prior : Prior
     hypotheses : Hypotheses or None
     simplified : tuple of str
@@ -44,7 +44,7 @@ class Product(NamedTuple):
 
 
 def make_fix(report: Report, product: Product, table: Table, settings: FusionSettings, stop: Stop = NEVER) -> Fix:
-    """Sum the hypotheses of a report up.
+    """Summarise the hypotheses of a report.
 
     Parameters
     ----------

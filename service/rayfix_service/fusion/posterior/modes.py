@@ -1,4 +1,4 @@
-"""From a mixture of hypotheses to candidates: the modes of the posterior, and which hypotheses belong to which.
+"""The candidates of a mixture of hypotheses: modes of the posterior, and the hypotheses that belong to each.
 
 The NumPy twins of some kernels are in ``reference.py``.
 """
@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.posterior.voxels import is_free_place, nearest_free
+from rayfix_service.fusion.posterior.voxels import is_free_position, nearest_free
 from rayfix_tables.gaussians.cholesky import cholesky, invert, solve
 
 _SAME_MODE = 9.0
@@ -57,7 +57,7 @@ def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
     probability : ndarray of shape (m,)
         Of each mode, the most probable first.
     position : ndarray of shape (m, 3), m
-        Mean of the mode's Gaussians; the mode itself, or the nearest free place, where the mean is in a solid.
+        Mean of the mode's Gaussians; the mode itself, or the nearest free position, where the mean is in a solid.
     moment : ndarray of shape (m, 3, 3), m2
         Second moment of the mode's Gaussians about ``position``.
     member : ndarray of int64, shape (h,)
@@ -89,12 +89,12 @@ def _modes(gaussians: Any, which: Any, total: Any, origin: Any, voxel_size: Any,
             position[member[h], i] += weight[h] * mean[h, i]
     for n in range(len(top)):
         position[n] /= probability[n]
-        if not is_free_place(free, origin, voxel_size, position[n]):
+        if not is_free_position(free, origin, voxel_size, position[n]):
             position[n] = top[n]
     moment = _second_moments(weight, mean, cov, member, probability, position)
     moved = False
     for n in range(len(top)):
-        if not is_free_place(free, origin, voxel_size, position[n]):
+        if not is_free_position(free, origin, voxel_size, position[n]):
             moved |= nearest_free(position[n], moment[n], origin, voxel_size, free)
     if moved:
         moment = _second_moments(weight, mean, cov, member, probability, position)
@@ -207,7 +207,7 @@ def climb(log_density: Any, mean: Any, precision: Any, start: Any, top: Any, cur
     lower = np.empty((3, 3))
     for _ in range(500):
         for n in range(len(top)):
-            # A hundredth: within a tenth of its deviation nothing but the mode itself attracts.
+            # A hundredth: within a tenth of its standard deviation only the mode itself attracts.
             if _square(x, top[n], curvature[n]) < 0.01:
                 return x, matrix, n
         highest = -np.inf

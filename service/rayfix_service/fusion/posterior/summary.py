@@ -1,4 +1,4 @@
-"""Sum the hypotheses of a report up, in one compiled kernel: there are few of them, but much is asked of each."""
+"""Summarise the hypotheses of a report, in one compiled kernel: there are few of them, but many steps for each."""
 
 import math
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ _NUM_POINTS = 1024
 
 
 class Summary(NamedTuple):
-    """What the hypotheses of a report come to.
+    """Summary of the hypotheses of a report.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Summary(NamedTuple):
     moment : ndarray of shape (m, 3, 3), m2
         Second moment of each mode about its position.
     outlier : ndarray of shape (count,)
-        Posterior probability of each of the culprits' measurements to be an outlier.
+        Posterior probability of each measurement of the index to be an outlier.
     half_bad : float
         Posterior probability that at least half of the observations are outliers altogether.
     points : DrawnPoints
@@ -55,7 +55,7 @@ class Summary(NamedTuple):
 def sum_up(
     hypotheses: Hypotheses, outlier_index: OutlierIndex, free_space: FreeSpace, floor: float, stop: Stop = NEVER
 ) -> Summary:
-    """Sum hypotheses up, cut to the free space.
+    """Summarise hypotheses, cut to the free space.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def sum_up(
         At least one. One whose covariance is not positive definite has no weight; where no other is, there are no
         modes and everything is outliers.
     floor : float
-        Hypotheses whose share of the posterior is below this are left out of the modes.
+        Hypotheses whose posterior probability is below this are left out of the modes.
     stop : Stop
         Ends it early.
 

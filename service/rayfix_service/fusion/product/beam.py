@@ -1,4 +1,4 @@
-"""Multiply factors: hypotheses that pick one alternative of each, the best of them kept and the like merged."""
+"""Multiply factors: hypotheses of one alternative of each factor; the best are kept and similar ones merged."""
 
 import itertools
 import math
@@ -14,7 +14,7 @@ from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.stopping import NEVER, Stop
 
 _MOST_PRODUCTS = 1e15
-"""More than anybody waits for: as good as infinitely many, and their number still fits an integer."""
+"""Stands for no limit: more products than can be formed in any reasonable time, and the number fits an integer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ def multiply(
     prior : Prior
         Of the position.
     width : int
-        Products that are kept after each factor, before those that mean the same are merged.
+        Products that are kept after each factor, before similar ones are merged.
     max_divergence : float
         What such a merge may cost, nats.
     most_products : float

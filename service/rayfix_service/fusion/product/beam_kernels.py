@@ -16,7 +16,10 @@ from rayfix_tables.gaussians.cholesky import cholesky
 from rayfix_tables.gaussians.triangles import triangle
 
 HOPELESS = 20.0
-"""A product this many nats below the best is given up: more than one station to come would have to be an outlier."""
+"""A product this many nats below the best is dropped: two of the next stations would have to be outliers."""
+
+_LOWEST = float(np.finfo(np.float64).min)
+"""A logarithm below all others."""
 
 _RANKED_AFTER = 26
 """Factors after which numbers of outlier patterns are ranked: 3**26 times a million hypotheses is below 2**63."""
@@ -51,7 +54,7 @@ class BeamLimits(NamedTuple):
     max_divergence : float
         What a merge may cost, nats.
     most_products : float
-        Products that may be formed, in those of no clock. Each factor may take its part of what is left.
+        Products that may be formed, in those of no clock. Each factor may use an equal part of what is left.
     """
 
     width: int
@@ -61,7 +64,7 @@ class BeamLimits(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def multiply_factors(factors: Any, prior: Any, log_range: Any, limits: Any, stop: Any) -> Any:
-    """Extend a beam by one factor after the other, merging hypotheses that mean the same.
+    """Extend a beam by one factor after the other, merging similar hypotheses.
 
     Parameters
     ----------
@@ -101,26 +104,26 @@ def multiply_factors(factors: Any, prior: Any, log_range: Any, limits: Any, stop
     product_cost, merge_cost = product_costs(dimension_of(alternatives))
     left_over, omitted, dropped = most_products, 0, 0
     order = _order(alternatives[-1], offsets)
-    for place in range(len(order)):
+    for step in range(len(order)):
         if stop[0] != 0:
             break
-        factor = order[place]
+        factor = order[step]
         begin, end = offsets[factor], offsets[factor + 1]
         own = np.ascontiguousarray(alternatives[:, begin:end])
-        # Half of a factor's share is for the products, half for merging them.
-        share = 0.5 * left_over / (len(order) - place)
-        most = max(1, int(share / (product_cost * (end - begin))))
+        # Half of a factor's budget is for the products, half for merging them.
+        budget = 0.5 * left_over / (len(order) - step)
+        most = max(1, int(budget / (product_cost * (end - begin))))
         if most < beam.shape[1]:
             omitted += beam.shape[1] - most
             beam = np.ascontiguousarray(beam[:, :most])
-        kept = max(1, min(width, int(share / merge_cost)))
+        kept = max(1, min(width, int(budget / merge_cost)))
         parent, choice, score, singular = extend_beam(beam, own, kept, HOPELESS, log_volume, log_range, stop)
         dropped += singular
         if kept < width and len(score) == kept:
             omitted += 1  # at least
         left_over -= product_cost * beam.shape[1] * (end - begin) + merge_cost * len(score)
         product = np.empty((len(beam), len(score)))
-        next_pattern = extend_patterns(pattern[parent], outlier[begin + choice], place)
+        next_pattern = extend_patterns(pattern[parent], outlier[begin + choice], step)
         for row in range(len(beam)):
             for n in range(len(score)):
                 product[row, n] = beam[row, parent[n]] + own[row, choice[n]]
@@ -143,8 +146,8 @@ def multiply_factors(factors: Any, prior: Any, log_range: Any, limits: Any, stop
 
 
 @numba.njit(cache=True, nogil=True)
-def extend_patterns(pattern: Any, outlier: Any, place: Any) -> Any:
-    """Give numbers to what hypotheses take for outliers, one factor more included; equal numbers mean equal patterns.
+def extend_patterns(pattern: Any, outlier: Any, num_before: Any) -> Any:
+    """Extend the numbers of hypotheses' outlier patterns by one factor; equal numbers mean equal patterns.
 
     A number has a digit to the base 3 for each factor. Every so many factors the numbers are replaced by their ranks,
     before they exceed 63 bits.
@@ -155,11 +158,11 @@ def extend_patterns(pattern: Any, outlier: Any, place: Any) -> Any:
         Numbers without the factor.
     outlier : ndarray of int8, shape (h,)
         What each hypothesis takes for an outlier in the factor: 0, 1 or 2.
-    place : int
+    num_before : int
         Number of factors before this one.
     """
     extended = 3 * pattern + outlier
-    if place % _RANKED_AFTER != _RANKED_AFTER - 1:
+    if num_before % _RANKED_AFTER != _RANKED_AFTER - 1:
         return extended
     ranked = np.empty_like(extended)
     rank, order = -1, np.argsort(extended)
@@ -179,9 +182,9 @@ def product_costs(dimension: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _order(log_scale: Any, offsets: Any) -> Any:
-    """Order in which factors are taken, shape (n,): few alternatives first, which cut the beam before it meets many.
+    """Order in which factors are taken, shape (n,): those with few alternatives first, which keep the beam narrow.
 
-    Which of two alike comes first must not depend on the report's order.
+    Which of two equal ones comes first must not depend on the report's order.
     """
     total = np.empty(len(offsets) - 1)
     for factor in range(len(total)):
@@ -192,7 +195,7 @@ def _order(log_scale: Any, offsets: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _prior_column(dimension: Any, prior: Any, log_range: Any) -> Any:
-    """Prior of position and clocks, shape (rows, 1); a clock lies evenly in a range of that logarithm."""
+    """Prior of position and clocks, shape (rows, 1); a clock's offset is uniform over a range of that logarithm."""
     log_volume, precision, eta = prior
     column = np.zeros((triangle(dimension) + dimension + 1, 1))
     column[triangle(3) - 1] = precision
@@ -208,13 +211,13 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
     Parameters
     ----------
     beam : ndarray of shape (rows, h)
-        Hypotheses; the better come first for speed alone.
+        Hypotheses; the better ones come first, for speed only.
     factor : ndarray of shape (rows, k)
         Alternatives.
     width : int
         Products to keep.
     hopeless : float
-        Products this many nats below the best are given up.
+        Products this many nats below the best are dropped.
     log_volume, log_range : float
         As in :func:`~rayfix_service.fusion.product.information_form.log_integrals`.
     stop : ndarray of uint8, shape (1,)
@@ -237,16 +240,17 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
     score = np.empty(most)
     heap = np.empty(most, np.int64)
     kept, dropped = 0, 0
-    top = -np.inf
+    top = _LOWEST  # not -inf, which a singular product has
     for h in range(beam.shape[1]):
         if stop[0] != 0:
             break
         add(beam, h, factor, products)
         log_integrals(products, log_volume, log_range, scratch, values)
+        for k in range(count):  # a loop of its own, which the compiler turns into a few instructions
+            dropped += not values[k] > -np.inf
         for k in range(count):
             value = values[k]
-            if not value >= top - hopeless or value == -np.inf:
-                dropped += not value > -np.inf
+            if not value >= top - hopeless:
                 continue
             top = max(top, value)
             if kept < most:
@@ -289,7 +293,7 @@ def _sift_down(scores: Any, heap: Any, count: Any) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def place_hypotheses(beam: Any, score: Any, chosen: Any) -> Any:
-    """Give means and covariances of the position, of the hypotheses that say something of it.
+    """Give means and covariances of the position, of the hypotheses that constrain it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Turn an observation into a factor: alternatives for what the measured path may be."""
+"""Turn an observation into a factor: alternatives for the path that was measured."""
 
 import itertools
 import math
@@ -33,7 +33,7 @@ _ANY_LENGTH = Term(0.0, 0.0, math.inf)
 
 @dataclass(frozen=True, kw_only=True)
 class Factor:
-    """Alternatives for what one path of the report says of the state z = (x, clock offsets).
+    """Alternatives for the likelihood of the state z = (x, clock offsets) given one path of the report.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Factor:
     outlier : ndarray of int8, shape (k,)
         ALL_GOOD, TIME_OUTLIER or ALL_OUTLIER; the last alternative is always ALL_OUTLIER.
     considered : int
-        Alternatives that were looked at for it.
+        Alternatives that were evaluated for it.
     omitted : bool
         Whether it has fewer alternatives than it would have without a bound on them.
     dropped : int
@@ -80,7 +80,7 @@ def make_factor(
     prior : Prior
         Not part of the factor, but of the judgement which alternatives are worth keeping.
     most_considered : int, optional
-        Alternatives to look at, though at least those of one combination of errors; as many as there are by default.
+        Alternatives to evaluate, though at least those of one combination of errors; all by default.
     stop : Stop
         Ends it early.
 
@@ -89,11 +89,11 @@ def make_factor(
     FixStoppedError
         When it was.
     """
-    said = observation.los_probability
-    seen = None if said is None else line_of_sight_weights(said, settings.sight_error)
+    indicated = observation.los_probability
+    weights = None if indicated is None else line_of_sight_weights(indicated, settings.sight_error)
     mixtures, bounds = [], [0]
     for spread in observation.angle_spreads:
-        mixtures.append(station.towards(_widened(observation.direction, spread.scale), seen))
+        mixtures.append(station.towards(_widened(observation.direction, spread.scale), weights))
         bounds.append(bounds[-1] + len(mixtures[-1]))
     if bounds[-1] == 0:
         return None
@@ -183,7 +183,7 @@ def _good_kinds(
 
     Also gives the readings of clocks that these take in, as :data:`READING` has them.
     """
-    # Readings are not in the evidence yet; what each clock will cost, whatever it shows, is its even prior.
+    # Readings are not in the evidence yet; each clock's uniform prior lowers it, whatever the clock shows.
     log_clocks = -len({reading.clock for reading in observation.readings}) * math.log(max_path_length)
     kinds = []
     readings: list[tuple[int, float, float]] = []
@@ -231,7 +231,7 @@ def _widened(measured: Direction, scale: float) -> Direction:
 
 
 def _log_angle_range(observation: Observation) -> float:
-    """Logarithm of the range over which an angle that is an outlier is spread evenly, in the units of the factor."""
+    """Logarithm of the range over which an angle that is an outlier is uniform, in the units of the factor."""
     if observation.angle_index is None:
         return 0.0
     return math.log(2.0 * math.pi if observation.direction.zenith is None else 4.0 * math.pi)

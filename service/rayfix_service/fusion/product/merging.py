@@ -1,8 +1,8 @@
-"""Merge alternatives and hypotheses that mean the same, so that the beam holds more of the posterior.
+"""Merge similar alternatives and hypotheses, so that the beam covers more of the posterior.
 
-Neighbouring tubes overlap once a measurement has cut them, and so do thousands of their products. Two that take the
-same measurements for outliers become one, with their moments, where that changes the mixture by no more than a stated
-divergence.
+Neighbouring tubes overlap once a measurement has conditioned them, and so do thousands of their products. Two that take
+the same measurements for outliers are replaced by one with their moments, if that changes the mixture by no more than a
+stated divergence.
 """
 
 from typing import Any
@@ -30,7 +30,7 @@ def merge_gaussians(log_weight: Any, mean: Any, cov: Any, noise: Any, max_diverg
     mean : ndarray of shape (n, 4), m
     cov : ndarray of shape (n, 4, 4), m2
     noise : tuple of 4 floats, m2
-        Variances under which Gaussians are told apart.
+        Variances of the noise under which Gaussians are compared.
     max_divergence : float
         What a merge may cost, nats.
 
@@ -77,7 +77,7 @@ def merge_hypotheses(columns: Any, score: Any, pattern: Any, max_divergence: Any
     size = dimension_of(columns)
     packed, det = columns.copy(), np.empty(len(score))
     invert_all(packed, size, det)
-    # A hypothesis that leaves something open is no Gaussian.
+    # A hypothesis that leaves the position or a clock unconstrained is no Gaussian.
     proper = np.flatnonzero((score > -np.inf) & (det > 0.0))
     if len(proper) == 0:
         return np.arange(len(score))
@@ -127,7 +127,7 @@ def _moments(columns: Any, packed: Any, which: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _write_back(columns: Any, score: Any, which: Any, log_weight: Any, mean: Any, cov: Any) -> Any:
-    """Turn weighted Gaussians into columns where their covariances are positive definite; tell where they are."""
+    """Turn weighted Gaussians into columns where their covariances are positive definite; return where they are."""
     size = mean.shape[1]
     first = triangle(size)
     packed, det = np.empty((first, len(which))), np.empty(len(which))

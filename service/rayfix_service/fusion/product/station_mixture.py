@@ -1,4 +1,4 @@
-"""What a station's part of the table says of a measured direction, as Gaussians over (position, path length)."""
+"""A station's mixture given a measured direction: Gaussians over (position, path length)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from rayfix_tables.mixture import Tubes
 from rayfix_tables.table import StationPart
 
 _RANGE_STDEV = 0.1
-"""Noise of path lengths, m, under which paths of all directions are told apart."""
+"""Noise of path lengths, m, under which paths of all directions are compared."""
 
 _MAX_DIVERGENCE = 1e-4
 """What merging two of them may cost, nats: a path length picks a small part of them all."""
@@ -51,7 +51,7 @@ class StationMixture(NamedTuple):
         return StationMixture(self.log_evidence + log_weight, self.mean, self.cov)
 
     def merged(self) -> "StationMixture":
-        """Merge in place those that no path length tells apart."""
+        """Merge in place those that no path length distinguishes."""
         return self.those(merge_gaussians(*self, (0.0, 0.0, 0.0, _RANGE_STDEV**2), _MAX_DIVERGENCE))
 
 
@@ -93,7 +93,7 @@ class StationMixtures:
 
     @cached_property
     def everywhere(self) -> StationMixture:
-        """Gaussians of the paths of all directions, those merged that no path length tells apart."""
+        """Gaussians of the paths of all directions, those merged that no path length distinguishes."""
         return _condition(look_up(self.part.levels, NO_DIRECTION)).merged()
 
     @cached_property
@@ -150,11 +150,11 @@ def _condition_cells(components: Any, looked_up: Any) -> Any:
 
 
 def is_direct(lookup: Lookup) -> NDArray[np.bool_]:
-    """Tell which components of the cells of a lookup, cell after cell, are of paths without a reflection.
+    """Find which components of the cells of a lookup, cell after cell, are of paths without a reflection.
 
     A component of several paths counts as the one that carries most of it.
     """
     offsets = lookup.level.cell_offsets
     begins, counts = offsets[lookup.cells], offsets[lookup.cells + 1] - offsets[lookup.cells]
-    places = np.repeat(begins - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
-    return np.asarray(lookup.level.mixture.num_reflections[places] == 0)
+    rows = np.repeat(begins - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
+    return np.asarray(lookup.level.mixture.num_reflections[rows] == 0)

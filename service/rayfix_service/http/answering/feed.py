@@ -1,4 +1,4 @@
-"""The feed of fixes: every fix that is located, told to whoever listens."""
+"""The feed of fixes: every fix is sent to all listeners."""
 
 import asyncio
 from collections import deque
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from rayfix_service.http.settings import FeedLimits
 
 _RELAY_BYTES = 32 << 20
-"""Fixes that wait for another worker, which hears for all of its listeners."""
+"""Bytes of fixes that wait for another worker, which receives them for all of its listeners."""
 
 QUEUE_LENGTH = 256
 """Fixes that wait for a listener; of one that reads more slowly, the oldest are dropped."""
@@ -38,14 +38,14 @@ class FixEvent:
 
 
 class Subscription:
-    """What waits for one listener.
+    """The queue of one listener.
 
     Parameters
     ----------
     table, target_id : str, optional
-        The only table and the only target to hear of.
+        The only table and the only target whose fixes are wanted.
     own : bool
-        Whether to hear only of what this process located.
+        Whether only fixes of this process are wanted.
     backlog_bytes : int
         Beyond which the oldest of several waiting events are dropped.
     """

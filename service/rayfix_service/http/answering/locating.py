@@ -78,7 +78,7 @@ def foreign(adapted: Adapted) -> Incoming:
 
 
 class Located(NamedTuple):
-    """A fix, the track of its target if that is wanted, and the time that the fix took, s."""
+    """A fix, the track of its target if that is requested, and the time that the fix took, s."""
 
     fix: Fix
     track: TrackedPosition | None
@@ -94,11 +94,11 @@ class Answerer:
     metrics : Metrics
         To add to.
     feed : FixFeed
-        To tell of fixes.
+        To publish fixes in.
     slow_work : SlowWork
         Threads for what takes longer, by its estimate, than ``quick_seconds``.
     hub : OmloxHub or None
-        To tell of positions.
+        To send positions to.
     quick_seconds : float
         What a fix may take on the event loop.
     reading : asyncio.Lock
@@ -126,7 +126,7 @@ class Answerer:
             return await asyncio.to_thread(parse, body)
 
     async def answer(self, table: ServedTable, incoming: Incoming, options: ResponseOptions) -> dict[str, Any]:
-        """Locate a report with a table and write the answer as wanted.
+        """Locate a report with a table and write the answer in the requested format.
 
         Raises
         ------
@@ -136,7 +136,7 @@ class Answerer:
         return self.write(table, incoming, options, await self.locate(table, incoming, options))
 
     async def locate(self, table: ServedTable, incoming: Incoming, options: ResponseOptions) -> Located:
-        """Locate a report with a table, and follow its target if that is wanted.
+        """Locate a report with a table, and follow its target if that is requested.
 
         A fix that takes less than a millisecond or a few by its estimate, as most do, is made right on the event loop.
         In the thread pool that FastAPI has for "def" such fixes would wait for each other's GIL; more worker processes
@@ -172,7 +172,7 @@ class Answerer:
     def write(
         self, table: ServedTable, incoming: Incoming, options: ResponseOptions, located: Located
     ) -> dict[str, Any]:
-        """Tell who listens of a fix, and write the answer as wanted.
+        """Publish a fix, and write the answer in the requested format.
 
         Raises
         ------
@@ -210,6 +210,6 @@ def problem_of(error: Exception) -> dict[str, Any]:
 
 
 def _event(table: str, incoming: Incoming, located: Located) -> bytes:
-    """Write what the feed tells of a fix."""
+    """Write the event of a fix for the feed."""
     fix = fix_to_document(located.fix, located.seconds, located.track)
     return to_json({"table": table, "report": incoming.native_document(), "fix": fix})

@@ -32,7 +32,7 @@ class ResponseOptions:
     track : bool
         Whether targets are followed.
     must_track : bool
-        Whether the request itself says so: a report that cannot be followed is then refused.
+        Whether the request itself asks for it: a report that cannot be followed is then refused.
     """
 
     output: OutputFormat = "native"

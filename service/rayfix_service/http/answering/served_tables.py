@@ -57,7 +57,7 @@ class ServedTable:
 
 @dataclass(frozen=True, kw_only=True)
 class TableChange:
-    """What became of a table's file at a look at it; ``reason`` says why it was refused, without its folder."""
+    """Result of a check of a table's file; ``reason`` gives the cause of a refusal, without the file's folder."""
 
     name: str
     change: Change
@@ -187,7 +187,7 @@ class Tables:
         A table, or a folder of tables.
     metrics : Metrics
     runtime_folder : pathlib.Path, optional
-        Folder through which the workers of one service tell each other to look at all files.
+        Folder through which the workers of one service ask each other to check all files.
     at_hand : dict of str to ServedTable, optional
         Tables that are loaded already, by name. One whose file has not changed since is served at once, and one whose
         file has become a bad one, too. Each is taken out, so that nothing holds it when it is swapped.
@@ -285,7 +285,7 @@ class Tables:
             _log.critical("not ready", exc_info=True)
             changes = [TableChange(name="", change="refused")]
         if not self.became_ready.is_set() and any(change.change == "refused" for change in changes):
-            self._failure = "a table does not pass its check, the log says why; replace it"
+            self._failure = "a table does not pass its check, the log has the cause; replace it"
         before = dict(self._looked_at)
         try:
             while True:
@@ -321,7 +321,7 @@ class Tables:
         return changes
 
     async def reload(self) -> list[TableChange]:
-        """Look at all files, and tell the other workers to."""
+        """Check all files, and ask the other workers to."""
         changes = await self.refresh(again=True)
         if self._marker is not None:
             self._marker.write_bytes(b"")
@@ -430,7 +430,7 @@ class Tables:
         if isinstance(error, RayfixError | OSError):
             reason = str(error).replace(str(path), path.name)
         else:
-            reason = f"{path.name} cannot be loaded; the log says why"
+            reason = f"{path.name} cannot be loaded; the log has the cause"
         if isinstance(error, TableError) and not isinstance(error, VERDICTS) and state is not None:
             # It may be over soon: no memory for the check, no right to read the file.
             self._looked_at.pop(name, None)
@@ -440,7 +440,7 @@ class Tables:
         self._become_ready()
         change = TableChange(name=name, change="refused", reason=reason)
         if before == self._refused[name]:
-            return change  # said already
+            return change  # logged already
         self._metrics.table_refused()
         if isinstance(error, RayfixError | OSError):
             _log.error("table refused: %s", error)

@@ -83,21 +83,21 @@ class SlowWork:
         work = loop.run_in_executor(self._executor, partial(locate, report, stop=stop))
         work.add_done_callback(self._done)
         try:
-            # A thread cannot be ended: what is given up keeps its place among those under way until it has stopped.
+            # A thread cannot be ended: what is given up counts as under way until it has stopped.
             return await asyncio.wait_for(asyncio.shield(work), self._seconds)
         except (TimeoutError, FixStoppedError):
             raise ProblemError(
                 FIX_TIMEOUT, f"the fix took longer than {self._seconds:g} s; send fewer measurements"
             ) from None
         finally:
-            # Also when nobody waits any more.
+            # Also when the request was cancelled.
             stop.set()
             work.cancel()  # if it has not begun
 
     def _done(self, work: "asyncio.Future[T]") -> None:
         self._under_way -= 1
         if not work.cancelled():
-            work.exception()  # seen, also of one that was given up
+            work.exception()  # retrieved, also of one that was given up
 
     def close(self) -> None:
         """End the threads."""

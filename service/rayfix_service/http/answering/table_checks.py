@@ -32,7 +32,7 @@ class TableChecks:
     Parameters
     ----------
     folder : pathlib.Path, optional
-        Folder that the workers of a service share. What one of them has checked, the others do not check again.
+        Common folder of the workers of a service. What one of them has checked, the others do not check again.
     limits : CheckLimits, optional
         What a check may take.
     """
