@@ -55,7 +55,7 @@ def adapted_report(
     timestamp: str | None,
     height: Height | None = None,
 ) -> Adapted:
-    """Put measurements and what was left out together.
+    """Combine measurements and what was left out.
 
     Quantised as other systems' are, an angle or an arrival may well come twice; it is then counted once.
 
@@ -103,7 +103,7 @@ def with_height(adapted: Adapted, height: Height | None) -> Adapted:
 
 
 def error_in_message(error: ReportError, adapted: Adapted) -> InvalidReportError:
-    """Say of an error of the report where in the message it comes from."""
+    """Name in an error of the report the field of the message that it comes from."""
     source: Path = ()
     if len(error.path) > 1 and error.path[0] == "measurements" and isinstance(error.path[1], int):
         source = adapted.sources[error.path[1]]
@@ -133,7 +133,7 @@ def station_map(pairs: Iterable[str]) -> dict[str, str]:
 
 
 def check_stations(stations: Mapping[str, str], known: Collection[str]) -> None:
-    """Refuse a map to stations that a table does not have: it would be noticed with the first message only.
+    """Refuse a map to stations that a table does not have: else only the first message would show the mistake.
 
     Raises
     ------

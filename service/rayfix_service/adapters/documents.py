@@ -19,7 +19,7 @@ MAX_MESSAGE_VALUES = 50_000
 """Values that the JSON text of a message may have, those that are not read counted."""
 
 _SHORT = 64 << 10
-"""Bytes of a message that is validated without a look at how many values it has."""
+"""Bytes of a message up to which its values are not counted before the validation."""
 
 M = TypeVar("M", bound=WireModel)
 
@@ -67,7 +67,7 @@ def check(
     check_counts: Callable[[Mapping[str, Any]], None] | None = None,
     unwrap: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
 ) -> M:
-    """Validate a message; how much it holds is looked at first.
+    """Validate a message, after a check of its size.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def check(
 
 
 def too_much(path: Path, text: str) -> InvalidReportError:
-    """Make the error of a message that has too much of something."""
+    """Make the error of a message that exceeds a limit."""
     return InvalidReportError((FieldProblem(path=path, message=text),))
 
 

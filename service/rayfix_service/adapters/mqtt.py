@@ -37,7 +37,7 @@ class BrokerError(RayfixError):
 
 @dataclass(frozen=True, kw_only=True)
 class Broker:
-    """Where the broker is, and who asks."""
+    """Address of the broker, and the credentials for it."""
 
     host: str
     port: int = 1883
@@ -149,7 +149,7 @@ def topic_for(publish: str, target_id: str) -> str:
 async def run_mqtt(
     locator: Locator, broker: Broker, settings: MqttSettings, *, on_ready: Callable[[], None] | None = None
 ) -> None:
-    """Locate until cancelled; a lost connection is made again, with pauses of 1 to 30 s.
+    """Locate until cancelled; a broken connection is established again, with pauses of 1 to 30 s.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ async def run_mqtt(
 
 
 async def _run_session(session: "_Session", broker: Broker, on_ready: Callable[[], None] | None) -> None:
-    """Connect, and again when the connection is lost."""
+    """Connect, and again when the connection breaks."""
     address, topic = f"{broker.host}:{broker.port}", session.settings.topic
     connected, pause = False, 1.0
     while True:
@@ -226,7 +226,7 @@ async def _first_of(*coroutines: Coroutine[Any, Any, None]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Session:
-    """What answers packets: the table, and what is remembered from one to the next."""
+    """Locates packets: the table, and the state from one packet to the next."""
 
     locator: Locator
     settings: MqttSettings
@@ -243,7 +243,7 @@ class _Session:
         )
 
     async def read(self, client: aiomqtt.Client) -> None:
-        """Take all messages; one that cannot be read costs nothing but itself."""
+        """Take all messages; one that cannot be read is skipped."""
         async for message in client.messages:
             if isinstance(message.payload, bytes):
                 await self._publish(client, self._receive(message.topic.value, message.payload))
@@ -272,7 +272,7 @@ class _Session:
                 _log.info("no position of '%s': %s", target, in_log(str(error), most=1000))
                 continue
             except Exception:
-                # A defect that one packet meets must not end the service.
+                # A defect in one packet's fix must not end the service.
                 self.failed["defect"] += 1
                 _log.exception("a packet of '%s' failed", target)
                 continue

@@ -1,4 +1,4 @@
-"""Telling an omlox hub of positions (omlox Hub API, version 2: ``PUT /providers/{provider_id}/location``).
+"""Sending positions to an omlox hub (omlox Hub API, version 2: ``PUT /providers/{provider_id}/location``).
 
 Locations wait in lanes, each sent one after the other, so that those of one target keep their order. Nothing here ever
 waits for the hub but the lanes: of a hub that is slow or gone, the oldest locations are dropped.
@@ -133,7 +133,7 @@ class OmloxHub:
                 try:
                     outcome = await self._send(client, lane.waiting.popleft())
                 except Exception:
-                    # A defect that one location meets must not end its lane.
+                    # A defect with one location must not end its lane.
                     _log.exception("a location could not be sent")
                 lane.sending = False
                 self._on_outcome(outcome)

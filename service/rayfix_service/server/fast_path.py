@@ -1,4 +1,4 @@
-"""A way past the router for the route that is asked most."""
+"""A path past the router for the most frequent route."""
 
 from collections.abc import Awaitable, Callable
 

@@ -63,7 +63,7 @@ class GatheringTransport:
         self.lingers = False
 
     def __getattr__(self, name: str) -> Any:
-        """Find what is not written here."""
+        """Forward attributes to the transport."""
         return getattr(self._transport, name)
 
     def write(self, data: bytes) -> None:
@@ -309,7 +309,7 @@ class GatheringProtocol(HttpToolsProtocol):
     # --- refusals
 
     def send_400_response(self, msg: str) -> None:
-        """Answer what is no request that this service takes."""
+        """Answer a request that this service does not accept."""
         status, reason, text = self._refusal or (400, "malformed", msg)
         self._refusal = None
         self._refuse(status, reason, text)
@@ -355,7 +355,7 @@ class GatheringProtocol(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         if self.flow.read_paused or (what == "head" and self._is_answering()):
-            # It is not the client that keeps this waiting.
+            # The delay is not the client's.
             self._time(what, seconds)
         elif what == "body":
             self._refuse(408, "body_too_slow", f"the body did not come within {seconds:g} s")
@@ -400,7 +400,7 @@ class SocketProtocol(WebSocketsSansIOProtocol):
     """Web sockets, whose handshakes are refused without a traceback where they are none."""
 
     def handle_parser_exception(self) -> None:
-        """End a connection that sends nonsense."""
+        """End a connection whose data are no valid frames."""
         if self.conn.close_sent is None:  # within the handshake
             self.transport.write(b"HTTP/1.1 400 Bad Request\r\nconnection: close\r\ncontent-length: 0\r\n\r\n")
             self.transport.close()

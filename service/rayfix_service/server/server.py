@@ -211,7 +211,7 @@ def _runtime_folder() -> Iterator[Path]:
                 f"the workers need a temporary folder and there is none ({error.strerror}); set TMPDIR to one"
             ) from None
         if MULTIPROCESS_VARIABLE not in os.environ:
-            # Whichever worker is asked answers for all.
+            # The worker that is asked answers for all.
             (folder / "metrics").mkdir()
             os.environ[MULTIPROCESS_VARIABLE] = str(folder / "metrics")
             stack.callback(os.environ.pop, MULTIPROCESS_VARIABLE)

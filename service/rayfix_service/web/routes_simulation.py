@@ -47,7 +47,7 @@ SIMULATION_EXAMPLES = {
     "/viewer", summary="What the viewer may do", responses=problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY)
 )
 async def get_viewer_settings(request: Request, services: ServicesDep, served: TableDep) -> ViewerSettings:
-    """Tell what the service allows the viewer, and how long the paths of its table are."""
+    """Give the viewer's settings: whether it may simulate, and the most reflections of a path."""
     return viewer_settings(served.locator.table, simulation=services.settings.simulation)
 
 

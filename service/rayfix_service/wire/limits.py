@@ -21,7 +21,7 @@ _DEEPEST = 16
 
 
 def has_more_values(text: bytes, most: int) -> bool:
-    """Tell whether a JSON text has more than so many values; the work is bounded by that number.
+    """Check whether a JSON text has more than so many values; the work is bounded by that number.
 
     An object of n keys and an array of n elements count as n values each, or as 1 when they are empty. What comes after
     too deep a nesting, where the parser ends, does not count.

@@ -1,4 +1,4 @@
-"""What can be wrong with a document, in words that name the field, its value and the remedy.
+"""Errors of a document, with messages that name the field, its value and the remedy.
 
 ::
 
@@ -89,7 +89,7 @@ def invalid_report(
     what: str,
     most: int = MAX_PROBLEMS,
 ) -> InvalidReportError:
-    """Say in this project's words what pydantic found wrong with a document.
+    """Translate pydantic's errors of a document into this project's messages.
 
     The time and memory that this takes do not grow with the number of errors, which a megabyte can have 100,000 of.
 
@@ -119,7 +119,7 @@ def invalid_report(
 
 
 def problem_of(root: type[WireModel], error: ErrorDetails, what: str) -> FieldProblem:
-    """Word what pydantic found wrong with a document.
+    """Translate one of pydantic's errors.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def problem_of(root: type[WireModel], error: ErrorDetails, what: str) -> FieldPr
 
 
 def parameter_problem(error: Mapping[str, Any]) -> FieldProblem:
-    """Word what FastAPI found wrong with a parameter of a request, for which there is no model."""
+    """Translate FastAPI's error of a parameter of a request, for which there is no model."""
     path = tuple(error["loc"][1:])
     return FieldProblem(path=path, message=f"{path_text(path)}: {error['msg']}")
 

@@ -19,7 +19,7 @@ from rayfix_service.wire.problems import (
 )
 
 _SHORT = 16 << 10
-"""Bytes of a report that is validated without a look at how many values it has."""
+"""Bytes of a report up to which its values are not counted before the validation."""
 
 
 def read_json(body: bytes) -> object:

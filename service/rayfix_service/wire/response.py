@@ -21,7 +21,7 @@ class CandidateDocument(BaseModel):
 
 
 class OutcomeDocument(BaseModel):
-    """What became of one measurement."""
+    """Outcome of one measurement."""
 
     model_config = ConfigDict(title="Outcome")
 

@@ -39,7 +39,7 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What became of one measurement of the report.
+    """Outcome of one measurement of the report.
 
     Attributes
     ----------

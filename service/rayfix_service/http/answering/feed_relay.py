@@ -40,7 +40,7 @@ class FeedRelay:
         self._clients: set[asyncio.Task[None]] = set()
 
     async def keep(self) -> None:
-        """Serve the other workers, and stay connected to them while someone listens here; until it is cancelled."""
+        """Serve the other workers, and stay connected to them while there are listeners here; until it is cancelled."""
         server = await asyncio.start_unix_server(self._tell, self._own, limit=_LONGEST_LINE)
         try:
             while True:

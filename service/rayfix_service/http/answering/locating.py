@@ -87,7 +87,7 @@ class Located(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Answerer:
-    """What answers reports.
+    """Locates reports and writes the answers.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class Answerer:
     reading: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def read(self, parse: Callable[[bytes], T], body: bytes) -> T:
-        """Parse a body: a long one in a thread, one at a time, so that others are answered meanwhile.
+        """Parse a body: long ones in a thread, one at a time, so that other requests are answered meanwhile.
 
         Raises
         ------
@@ -204,7 +204,7 @@ def problem_of(error: Exception) -> dict[str, Any]:
             return report_problem(error)
         case ProblemError():
             return problem_document(error.kind, str(error))
-    # A defect that one report meets must not cost the other 999 their fix.
+    # A defect in one report's fix must not fail the other 999.
     _log.error("a report of several failed", exc_info=error)
     return internal_problem()
 

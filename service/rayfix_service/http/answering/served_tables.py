@@ -138,14 +138,14 @@ def load_tables(path: Path, *, checks: TableChecks | None = None) -> dict[str, S
 
 
 def forget_changed(tables: dict[str, ServedTable]) -> None:
-    """Take out the tables whose files are no longer those that they were read from."""
+    """Remove the tables whose files have changed since they were read."""
     for name, served in list(tables.items()):
         if file_state(served.locator.table.path) != served.state:
             del tables[name]
 
 
 def follow_changes(tables: dict[str, ServedTable], path: Path, checks: TableChecks, *, failed: set[FileState]) -> None:
-    """Put tables in that workers have loaded since, and take out those whose files are gone.
+    """Add tables that workers have loaded since, and remove those whose files are gone.
 
     A table whose file has become another stays until a worker has loaded that: so there is always one that can answer
     for whoever is forked next.
@@ -270,7 +270,7 @@ class Tables:
         )
 
     async def keep(self, seconds: float) -> None:
-        """Load all tables, then for ever what is new.
+        """Load all tables, then new ones until cancelled.
 
         A changed file is looked at once it has not changed between two looks.
 
@@ -299,7 +299,7 @@ class Tables:
                 task.cancel()
 
     async def refresh(self, *, again: bool = False) -> list[TableChange]:
-        """Look at all files; load those that are new.
+        """Check all files; load those that are new.
 
         Parameters
         ----------
@@ -358,7 +358,7 @@ class Tables:
         return name in self._refused and self._refused[name].state == state
 
     def _tell_unfit(self, found: FoundFiles) -> list[TableChange]:
-        """Refuse what cannot be a table by its name or kind, once; forget what is no longer there."""
+        """Refuse files that cannot be tables by name or kind, once; forget those that are gone."""
         if found.files:
             for name in self._refused.keys() - found.files.keys() - found.unfit.keys():
                 del self._refused[name]
@@ -432,7 +432,7 @@ class Tables:
         else:
             reason = f"{path.name} cannot be loaded; the log has the cause"
         if isinstance(error, TableError) and not isinstance(error, VERDICTS) and state is not None:
-            # It may be over soon: no memory for the check, no right to read the file.
+            # The cause may be temporary: no memory for the check, no permission to read the file.
             self._looked_at.pop(name, None)
             self._not_before[name] = asyncio.get_running_loop().time() + _AGAIN_SECONDS
         before, self._refused[name] = self._refused.get(name), Refusal(state=state, reason=reason)

@@ -18,7 +18,7 @@ class Stoppable(Protocol[Asked_contra, T_co]):
     """Work that ends early, by a :class:`FixStoppedError`, once ``stop`` is set."""
 
     def __call__(self, asked: Asked_contra, /, *, stop: Stop) -> T_co:
-        """Do it."""
+        """Do the work."""
 
 
 class SlowWork:
@@ -46,7 +46,7 @@ class SlowWork:
         return self._under_way
 
     async def run(self, work: Callable[[], T]) -> T:
-        """Do in a thread what cannot be stopped, but takes well below a second.
+        """Do work in a thread that cannot be stopped, but takes well below a second.
 
         Raises
         ------
@@ -61,7 +61,7 @@ class SlowWork:
         return await self.locate(do, None)
 
     async def locate(self, locate: Stoppable[Asked_contra, T], report: Asked_contra) -> T:
-        """Locate a report in a thread, or do what takes as long with something else that was asked.
+        """Locate a report in a thread, or do other work of similar length.
 
         Raises
         ------

@@ -66,7 +66,7 @@ class TableChecks:
             return table_of_verdict(opened, verdict), opened.state
 
     def note_loaded(self, path: Path, state: FileState) -> None:
-        """Tell the other processes that a table has passed its check and could be loaded."""
+        """Record for the other processes that a table has passed its check and could be loaded."""
         if self._folder is not None:
             with contextlib.suppress(OSError):
                 (self._folder / f"{_key(path, state)}.loaded").touch()

@@ -1,4 +1,4 @@
-"""The files that tables come from: looked at, and not opened."""
+"""The files that tables come from: listed, and not opened."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +36,7 @@ class TableFiles:
     path: Path
 
     def look(self) -> FoundFiles:
-        """Look which files there are, and in which version.
+        """List the files and their versions.
 
         Raises
         ------
@@ -72,7 +72,7 @@ class TableFiles:
         return found.files
 
     def states(self) -> dict[str, FileState]:
-        """Look which files there are and in which version; empty where the folder has none."""
+        """List the files and their versions; empty where the folder has none."""
         try:
             return self.look().states
         except OSError:
@@ -87,7 +87,7 @@ def no_table(path: Path, found: FoundFiles) -> TableError:
 
 
 def why_unfit(path: Path) -> str | None:
-    """Say why a file cannot be a table, from its name and kind alone; None for one that can."""
+    """Return why a file cannot be a table, from its name and kind alone; None for one that can."""
     if not path.stem.isprintable():  # names appear in logs, figures and answers
         return f"{shown_name(path.name)} has characters in its name that cannot be shown; rename it"
     try:
@@ -103,7 +103,7 @@ def shown_name(name: str) -> str:
 
 
 def file_state(path: Path) -> FileState:
-    """Tell this version of a file from others."""
+    """Return what distinguishes this version of a file."""
     try:
         return state_of(path.stat())
     except OSError:
