@@ -89,7 +89,7 @@ class SortedReport(NamedTuple):
 class _Seen(NamedTuple):
     """A direction and its index in the report."""
 
-    index: int
+    angle_index: int
     direction: Direction
     spreads: tuple[Spread, ...]
 
@@ -236,7 +236,7 @@ def _observations(draft: _Draft) -> list[Observation]:
             lengths=tuple([terms for _, terms in lengths]),
             length_bias_variance=draft.station.bias.range_stdev**2,
             readings=tuple([reading for _, reading in readings]),
-            angle_index=angle.index if angle else None,
+            angle_index=angle.angle_index if angle else None,
             timing_indices=tuple(timing_indices),
             differences=tuple([index for arrival, _ in readings for index in arrival.differences]),
         )
