@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: client coverage viewer viewer-test browser screenshots demo lock test test-portable lint types package images accuracy openapi clean
+.PHONY: client coverage viewer viewer-test browser screenshots demo lock test test-kernels test-portable lint types package images accuracy openapi clean
 
 # pip takes what builds the package from these too: under the first name until 25.2, under the second from 25.3 on.
 PINNED := PIP_CONSTRAINT=$(CURDIR)/constraints.txt PIP_BUILD_CONSTRAINT=$(CURDIR)/constraints.txt
@@ -52,11 +52,16 @@ test-portable: $(VENV)/.done
 	$(BIN)/python tests/portable.py
 
 # What the quick tests run of the code; compiled kernels are seen by the tests of their twins alone, without the compiler.
-KERNEL_TESTS := tests/service/fusion/test_kernels.py tests/service/fusion/posterior tests/offline/fit tests/tables/gaussians
+KERNEL_TESTS := tests/service/fusion/test_kernels.py tests/service/fusion/product tests/service/fusion/posterior \
+	tests/offline/fit tests/tables/gaussians
+
+# Those tests with the kernels as plain Python, which checks every index.
+test-kernels: $(VENV)/.done
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -m "not slow" $(KERNEL_TESTS)
 
 coverage: $(VENV)/.done
 	$(BIN)/coverage run --parallel-mode -m pytest -m "not slow" --ignore tests/browser
-	NUMBA_DISABLE_JIT=1 $(BIN)/coverage run --parallel-mode -m pytest -m "not slow" -W ignore::RuntimeWarning $(KERNEL_TESTS)
+	NUMBA_DISABLE_JIT=1 $(BIN)/coverage run --parallel-mode -m pytest -m "not slow" $(KERNEL_TESTS)
 	$(BIN)/coverage combine
 	$(BIN)/coverage report
 

@@ -49,15 +49,12 @@ from rayfix_tables.table import Table
 from rayfix_tables.version import software_version
 
 if TYPE_CHECKING:
-    from rayfix.api import Locator as Locator
-    from rayfix.api import Tracker as Tracker
     from rayfix.api import build as build
     from rayfix.client import AsyncClient as AsyncClient
     from rayfix.client import Client as Client
     from rayfix.client import RetryPolicy as RetryPolicy
     from rayfix_service.adapters.mqtt import BrokerError as BrokerError
     from rayfix_service.adapters.omlox_hub import HubError as HubError
-    from rayfix_service.fusion.locator import Fused as Fused
     from rayfix_service.fusion.measurements.report import GAUSSIAN as GAUSSIAN
     from rayfix_service.fusion.measurements.report import HEAVY_TAILED as HEAVY_TAILED
     from rayfix_service.fusion.measurements.report import Angle as Angle
@@ -75,11 +72,13 @@ if TYPE_CHECKING:
     from rayfix_service.fusion.posterior.fix import Fix as Fix
     from rayfix_service.fusion.posterior.fix import Outcome as Outcome
     from rayfix_service.fusion.posterior.fix import Status as Status
+    from rayfix_service.fusion.posterior.fused import Fused as Fused
     from rayfix_service.fusion.posterior.posterior import Posterior as Posterior
     from rayfix_service.fusion.settings import FusionSettings as FusionSettings
     from rayfix_service.fusion.stopping import FixStoppedError as FixStoppedError
     from rayfix_service.fusion.stopping import Stop as Stop
     from rayfix_service.http.errors import ServiceError as ServiceError
+    from rayfix_service.locator import Locator as Locator
     from rayfix_service.measuring.impulse_response import range_from_impulse_response as range_from_impulse_response
     from rayfix_service.measuring.ranging import LogRangeEstimate as LogRangeEstimate
     from rayfix_service.measuring.ranging import RangeEstimate as RangeEstimate
@@ -91,6 +90,7 @@ if TYPE_CHECKING:
     from rayfix_service.tracking.track import Estimate as Estimate
     from rayfix_service.tracking.track import TrackedPosition as TrackedPosition
     from rayfix_service.tracking.track import TrackState as TrackState
+    from rayfix_service.tracking.tracker import Tracker as Tracker
 
 __version__ = software_version()
 
@@ -179,10 +179,12 @@ _LAZY = {
     ("rayfix_service.fusion.posterior.fix", "service"): ("Candidate", "Fix", "Outcome", "Status"),
     ("rayfix_service.fusion.posterior.credible", "service"): ("CredibleRegions",),
     ("rayfix_service.fusion.posterior.posterior", "service"): ("Posterior",),
-    ("rayfix_service.fusion.locator", "service"): ("Fused",),
+    ("rayfix_service.fusion.posterior.fused", "service"): ("Fused",),
+    ("rayfix_service.locator", "service"): ("Locator",),
     ("rayfix_service.tracking.motion", "service"): ("MotionModel",),
     ("rayfix_service.tracking.settings", "service"): ("TrackingSettings",),
     ("rayfix_service.tracking.track", "service"): ("Estimate", "TrackState", "TrackedPosition"),
+    ("rayfix_service.tracking.tracker", "service"): ("Tracker",),
     ("rayfix_service.measuring.ranging", "service"): (
         "LogRangeEstimate",
         "RangeEstimate",
@@ -194,7 +196,7 @@ _LAZY = {
     ("rayfix_service.http.errors", "service"): ("ServiceError",),
     ("rayfix_service.adapters.mqtt", "mqtt"): ("BrokerError",),
     ("rayfix_service.adapters.omlox_hub", "mqtt"): ("HubError",),
-    ("rayfix.api", "service"): ("Locator", "Tracker", "build"),
+    ("rayfix.api", "offline"): ("build",),
     ("rayfix.client", "client"): ("AsyncClient", "Client", "RetryPolicy"),
 }
 """Names by their module and the extra that it needs; a module is imported when a name of it is first used."""

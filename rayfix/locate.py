@@ -7,8 +7,8 @@ from typing import Any
 
 from rayfix_service.adapters.adapted import check_stations, error_in_message
 from rayfix_service.adapters.formats import InputFormat, OutputFormat, parse, write
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Height
+from rayfix_service.locator import Locator
 from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import ReportError
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rayfix.errors import ViewError
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_service.web.assets import INDEX, STATIC
 from rayfix_service.web.glb import write_glb
 from rayfix_service.web.viewer_settings import picture_posterior, viewer_settings

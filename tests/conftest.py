@@ -1,13 +1,28 @@
 """Fixtures that more than one test module uses."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
+import numba
+import numpy as np
 import pytest
 
 from rayfix.example.files import write_example
 from rayfix_offline.build import build_table
 from tests.support.checkout import SHARED
+
+
+@pytest.fixture(scope="session", autouse=True)
+def floating_point_as_compiled() -> Iterator[None]:
+    """Let NumPy divide by zero and overflow without a warning where kernels run as Python (NUMBA_DISABLE_JIT).
+
+    Compiled kernels do so, too. Other warnings remain errors.
+    """
+    with np.errstate(
+        **dict.fromkeys(("divide", "over", "under", "invalid"), "ignore") if numba.config.DISABLE_JIT else {}
+    ):
+        yield
 
 
 @pytest.fixture(scope="session")

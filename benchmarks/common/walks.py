@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rayfix_evaluation.drops.accuracy import Drop, clear_of_solids, drop_positions
 from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire import parse_report
 from rayfix_tables.freespace import FreeSpace

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import drop_uniformly, locate_drops
 from rayfix_evaluation.drops.simulate import Noise, Timing
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 
 CASES: list[tuple[float, Timing]] = [

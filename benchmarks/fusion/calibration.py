@@ -13,7 +13,7 @@ from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly, locate_drop
 from rayfix_evaluation.drops.calibration import calibrate, wilson_interval
 from rayfix_evaluation.drops.simulate import Noise, Rule, Timing
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 
 TIMINGS: tuple[Timing, ...] = ("none", "pt", "tdoa")
 DEVIATIONS_DEG = (0.25, 1.0, 5.0)

@@ -20,8 +20,8 @@ from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly
 from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
 from rayfix_evaluation.paper.locate import PaperLocator
 from rayfix_service.batch import locate_batch
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
 
 CASES: list[tuple[str, Timing, bool]] = [

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import Drop, drop_positions, drops_at, solver_of
 from rayfix_evaluation.drops.simulate import fold_direction, select_path
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import (
     GAUSSIAN,
     HEAVY_TAILED,
@@ -26,6 +25,7 @@ from rayfix_service.fusion.measurements.report import (
     Range,
     Report,
 )
+from rayfix_service.locator import Locator
 
 RANGE_STDEV = 0.5  # m
 CHI2_68 = 3.506  # of three degrees of freedom

@@ -12,7 +12,7 @@ from rayfix_evaluation.drops.accuracy import drops_at, locate_drops, solver_of
 from rayfix_evaluation.drops.simulate import Noise, Timing
 from rayfix_evaluation.planning.forecast import PlanMap, PlanSettings, draw_places, forecast
 from rayfix_evaluation.planning.station_mixture import audible_paths
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_tables.angles import direction
 from rayfix_tables.table import Table
 

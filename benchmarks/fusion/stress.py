@@ -25,8 +25,8 @@ from rayfix_evaluation.drops.stress import (
     with_scaled_stdevs,
     with_turned_stations,
 )
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
 from rayfix_tables.table import Table
 

@@ -12,7 +12,7 @@ from benchmarks.common.example_table import open_or_build, table_parser
 from benchmarks.common.walks import Errors, follow_walks, walk
 from rayfix_evaluation.drops.accuracy import drops_at, solver_of
 from rayfix_evaluation.drops.simulate import Noise, Timing
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_service.tracking.motion import MotionModel
 from rayfix_service.tracking.settings import TrackingSettings
 from rayfix_service.tracking.tracker import Tracker
@@ -72,7 +72,7 @@ def main() -> None:
             angle = float(np.deg2rad(degrees))
             found = follow_walks(
                 locator,
-                Tracker(table.scene, settings),
+                Tracker(table, settings),
                 walks,
                 Noise(azimuth_stdev=angle, zenith_stdev=angle, range_stdev=None if timing == "none" else 0.5),
                 interval=options.interval,

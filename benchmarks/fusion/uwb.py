@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from benchmarks.fusion.uwb_recordings import ANCHORS, Ranging, least_squares, read_ranging, site_text
 from rayfix_evaluation.drops.calibration import ellipsoid_holds
 from rayfix_offline.build import build_table
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Height, Range, Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 
 Array = NDArray[np.float64]

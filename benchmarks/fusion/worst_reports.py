@@ -15,10 +15,10 @@ import numpy as np
 
 from benchmarks.common.costly_reports import climb
 from benchmarks.common.example_table import open_or_build, table_parser
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.stopping import FixStoppedError, Stop
 from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.locator import Locator
 
 
 def main() -> None:

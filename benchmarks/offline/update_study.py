@@ -23,7 +23,7 @@ from rayfix_offline.fit.em import sample_points
 from rayfix_offline.rays.trace import trace_station
 from rayfix_offline.site import read_site
 from rayfix_offline.twin.twin import prepare_twin
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
 from rayfix_tables.table import Table
 

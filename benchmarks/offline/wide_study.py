@@ -35,7 +35,7 @@ from rayfix_offline.fit.wide_windows import sum_cells
 from rayfix_offline.rays.trace import LevelRays, level_grid
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin.twin import prepare_twin
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture
 from rayfix_tables.table import Table

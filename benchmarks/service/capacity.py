@@ -23,7 +23,7 @@ import psutil
 from benchmarks.common.example_table import open_or_build, table_parser
 from rayfix_evaluation.drops.accuracy import Drop, drop_uniformly
 from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
 
 CASES: list[tuple[str, float, Timing, bool]] = [

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from rayfix_tables.errors import SiteError
+from rayfix_tables.problems import path_text
 from rayfix_tables.site import SiteInfo, Station, StationBias
 
 MIN_WINDOW_RATIO = 1.5
@@ -195,7 +196,7 @@ def parse_site(document: dict[str, Any], *, source: str = "site") -> SiteFile:
 
 
 def _problem(error: Any) -> str:
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]).lstrip(".")
+    key = path_text(error["loc"])
     if error["type"] == "extra_forbidden":
         section = ".".join(str(part) for part in error["loc"][:-1] if isinstance(part, str))
         known = _known_keys(error["loc"][:-1])

@@ -54,7 +54,7 @@ def _plot(options: argparse.Namespace) -> int:
         from rayfix.view import read_reports
         from rayfix_evaluation.pictures.files import check_picture
         from rayfix_evaluation.pictures.report_plot import plot_report
-        from rayfix_service.fusion.locator import Locator
+        from rayfix_service.locator import Locator
         from rayfix_service.wire import fix_to_document, parse_report
         from rayfix_tables.checked import open_checked
         from rayfix_tables.errors import ReportError

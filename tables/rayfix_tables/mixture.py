@@ -15,7 +15,7 @@ angles much finer than the window would be believed less than they deserve.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,17 @@ def widening_cov(u_mean: NDArray[Any], u_cov: NDArray[Any], jacobian: NDArray[An
     return np.asarray(slopes @ products @ slopes.transpose(0, 2, 1))
 
 
+class Tubes(NamedTuple):
+    """The arrays of a :class:`TubeMixture` that kernels take, which know no dataclass."""
+
+    log_weight: NDArray[Any]
+    u_mean: NDArray[Any]
+    u_cov: NDArray[Any]
+    x_mean: NDArray[Any]
+    jacobian: NDArray[Any]
+    x_cov: NDArray[Any]
+
+
 @dataclass(frozen=True, kw_only=True)
 class TubeMixture:
     """Components of one or many cells, component axis first.
@@ -108,9 +119,9 @@ class TubeMixture:
         return len(self.log_weight)
 
     @property
-    def tubes(self) -> tuple[NDArray[Any], ...]:
-        """Arrays that :func:`~rayfix_tables.gaussians.conditioning.condition_on_angle` begins with."""
-        return self.log_weight, self.u_mean, self.u_cov, self.x_mean, self.jacobian, self.x_cov
+    def tubes(self) -> "Tubes":
+        """Arrays that kernels take."""
+        return Tubes(self.log_weight, self.u_mean, self.u_cov, self.x_mean, self.jacobian, self.x_cov)
 
     def __getitem__(self, index: slice | NDArray[np.int64]) -> "TubeMixture":
         """Components of a range, without a copy, or those of the given numbers."""

@@ -122,7 +122,7 @@ def test_locate_takes_and_gives_other_formats(
     status, _, err = run(capsys, *command[:5])
     assert status == 2
     assert "lines.txt: lines[0]: station 'A1' is not in the table" in one_line(err)
-    assert "say with stations which one is meant" in err
+    assert "give the station in the map stations" in err
     status, _, err = run(capsys, *command, "--station", "A1")
     assert status == 2
     assert "station 'A1' is no pair; give NAME=STATION" in one_line(err)

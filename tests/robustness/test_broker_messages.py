@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from rayfix_service.adapters.mqtt import BrokerError, MqttSettings, check_settings, topic_for
 from rayfix_service.adapters.silabs_stream import MAX_PAYLOAD, SilabsStream
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_service.wire.names import MAX_NAME, in_log, topic_level
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from benchmarks.common.costly_reports import random_measurement, random_report
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Height, Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.posterior.modes import find_modes
 from rayfix_service.fusion.posterior.voxels import nearest_free
 from rayfix_service.fusion.stopping import NEVER
+from rayfix_service.locator import Locator
 from rayfix_tables.errors import ReportError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Table

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from benchmarks.common.costly_reports import climb, random_report
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import (
     HEAVY_TAILED,
     Angle,
@@ -28,6 +27,7 @@ from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import FixStoppedError, Stop
 from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.locator import Locator
 from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire import report_to_document
 from rayfix_tables.errors import ReportError
@@ -197,7 +197,7 @@ def test_a_track_takes_in_a_bounded_number_of_hypotheses(locator: Locator) -> No
     )
     places = []
     for hypotheses in (many, many.best(512)):
-        tracker = Tracker(locator.table.scene)
+        tracker = Tracker(locator.table)
         for second in range(3):
             fix = replace(fused.fix, timestamp=f"2026-01-31T10:00:{second:02}Z")
             track = tracker.follow(replace(fused, fix=fix, hypotheses=hypotheses))

@@ -23,7 +23,7 @@ PACKAGES = (
 )
 
 IMPORT_ALL_KERNELS = """
-import rayfix_service.fusion.locator, rayfix_offline.build, rayfix_evaluation.truth.forward
+import rayfix_service.locator, rayfix_offline.build, rayfix_evaluation.truth.forward
 import os, sys
 print(os.environ.get("NUMBA_CACHE_DIR"))
 """

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from rayfix_service.batch import locate_batch
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Angle, Range, Report
 from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.locator import Locator
 from rayfix_tables.angles import angles_of
 from rayfix_tables.errors import ReportError, TableError
 from rayfix_tables.table import Table

@@ -23,7 +23,7 @@ import importlib, pkgutil
 for root in {roots!r}:
     package = importlib.import_module(root)
     names = [m.name for m in pkgutil.walk_packages(package.__path__, root + ".")]
-    compiled = ("tree_reduction", "conditioning", "triangles")
+    compiled = ("cholesky", "conditioning", "tree_reduction", "triangles")
     names = [name for name in names if name.rpartition(".")[2] not in ("__main__", *compiled)]
     for name in names:
         importlib.import_module(name)
@@ -33,7 +33,7 @@ print("imported")
 
 LOCATE = """
 import sys
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 Locator(Table.open(sys.argv[1])).warm_up()
 print("located")

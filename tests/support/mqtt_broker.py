@@ -16,8 +16,8 @@ import aiomqtt
 import pytest
 
 from rayfix_service.adapters.mqtt import Broker, MqttSettings, run_mqtt
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.http.openapi.examples import SILABS_EXAMPLES
+from rayfix_service.locator import Locator
 
 MESSAGE: dict[str, Any] = SILABS_EXAMPLES["three_locators"]["value"]
 TAG: str = MESSAGE["target_id"]

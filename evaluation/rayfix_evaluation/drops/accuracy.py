@@ -11,8 +11,8 @@ from rayfix_evaluation.drops.bound import position_error_bound
 from rayfix_evaluation.drops.simulate import Noise, Rule, Timing, select_path, simulate_report, uniform_drops
 from rayfix_evaluation.truth.forward import ForwardSolver, Paths
 from rayfix_offline.scene.materials import face_permittivity
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.site import Station

@@ -15,10 +15,10 @@ from rayfix_evaluation.paper.points import Launcher, RayPoints, draw_directions,
 from rayfix_evaluation.paper.selection import select_by_length
 from rayfix_evaluation.pictures.density import credible_levels, marginal_density
 from rayfix_evaluation.pictures.plot import SceneFigure, draw_candidates, draw_truth, make_figure
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.directions import Direction, to_scene, without_bias
 from rayfix_service.fusion.measurements.report import Angle, Range, Report
 from rayfix_service.fusion.product.station_mixture import StationMixtures
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 
 Layer = Literal["rays", "points", "mixture", "posterior", "fix"]

@@ -12,8 +12,8 @@ from rayfix_evaluation.drops.accuracy import clear_of_solids
 from rayfix_evaluation.drops.bound import information_bound
 from rayfix_evaluation.drops.simulate import Noise, Timing, fold_direction
 from rayfix_evaluation.planning.station_mixture import AudiblePaths, audible_paths
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, Report, TimeDifference, TimeOfArrival
+from rayfix_service.locator import Locator
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.site import Station
 from rayfix_tables.table import Table

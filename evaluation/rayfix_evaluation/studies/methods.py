@@ -20,8 +20,8 @@ from rayfix_evaluation.drops.simulate import Timing
 from rayfix_evaluation.paper.locate import PaperLocator
 from rayfix_evaluation.studies.plain_mixtures import PlainTableLocator
 from rayfix_evaluation.studies.summary import COVERAGE
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Height, Report
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 
 __all__ = ["METHODS", "Answer", "Method", "Question", "Tools"]
@@ -145,14 +145,18 @@ def _rayfix(variant: str) -> Callable[[Tools], Answering]:
     return make
 
 
+def _from_reports(locate: Callable[[Report], NDArray[np.float64] | None]) -> Answering:
+    """Answer by what needs no more than the report."""
+    return lambda question: Answer(position=locate(question.report))
+
+
 def _paper(tools: Tools) -> Answering:
     locator = PaperLocator.of_table(tools.table("site"))
     return lambda question: Answer(position=locator.locate(question.report, question.rng))
 
 
 def _paper_table(tools: Tools) -> Answering:
-    locator = PlainTableLocator(table=tools.table("paper"))
-    return lambda question: Answer(position=locator.locate(question.report))
+    return _from_reports(PlainTableLocator(table=tools.table("paper")).locate)
 
 
 def _planar(tools: Tools) -> Answering:
@@ -166,8 +170,7 @@ def _planar(tools: Tools) -> Answering:
 
 
 def _reverse_rays(tools: Tools) -> Answering:
-    locator = ReverseRays.of_table(tools.table("site"))
-    return lambda question: Answer(position=locator.locate(question.report))
+    return _from_reports(ReverseRays.of_table(tools.table("site")).locate)
 
 
 def _line_of_sight(kind: Kind) -> Callable[[Tools], Answering]:
@@ -175,16 +178,14 @@ def _line_of_sight(kind: Kind) -> Callable[[Tools], Answering]:
         table = tools.table("site")
         vertices = np.asarray(table.scene.vertices, np.float64)
         bounds = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
-        locator = LineOfSight(site=table.site, bounds=bounds, kinds=(kind,))
-        return lambda question: Answer(position=locator.locate(question.report))
+        return _from_reports(LineOfSight(site=table.site, bounds=bounds, kinds=(kind,)).locate)
 
     return make
 
 
 def _fingerprints(tools: Tools) -> Answering:
     assert tools.radio_map is not None
-    locator = Fingerprinting(site=tools.table("site").site, radio_map=tools.radio_map)
-    return lambda question: Answer(position=locator.locate(question.report))
+    return _from_reports(Fingerprinting(site=tools.table("site").site, radio_map=tools.radio_map).locate)
 
 
 _OURS = (

@@ -14,8 +14,8 @@ from rayfix_evaluation.paper.reports import sort_for_paper
 from rayfix_evaluation.paper.selection import select_by_length
 from rayfix_evaluation.studies.bench import Bench
 from rayfix_evaluation.studies.cases import Case, World, simulate_case
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.directions import Direction
+from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
 
 __all__ = ["draw_pictures"]

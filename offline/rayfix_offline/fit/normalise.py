@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from rayfix_offline.fit.settings import BalanceSettings
 from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.gaussians.conditioning import LOG_2PI, condition_on_angle
+from rayfix_tables.gaussians.conditioning import Conditioned, MeasuredCells, condition_on_angle
+from rayfix_tables.gaussians.constants import LOG_2PI
 from rayfix_tables.gaussians.definite import cholesky_factors
 from rayfix_tables.gaussians.normal_points import normal_points
 from rayfix_tables.level import UNBALANCED, Level
@@ -118,17 +119,14 @@ def _positions(level: Level, settings: BalanceSettings) -> _Positions:
         begin, end = int(level.cell_offsets[first]), int(level.cell_offsets[last])
         cells = slice(first, last)
         log_evidence, at, cov = np.empty(end - begin), np.empty((end - begin, 4)), np.empty((end - begin, 4, 4))
-        condition_on_angle(
-            *mixture.tubes,
-            np.asarray(level.cell_offsets[:-1][cells], np.int64),
-            np.asarray(level.cell_offsets[1:][cells], np.int64),
-            np.zeros((last - first, 2)),
-            np.repeat(np.array([[1.0, 0.0, 1.0]]) * window * noise / left, last - first, axis=0),
-            log_factor[cells],
-            log_evidence,
-            at,
-            cov,
+        measured = MeasuredCells(
+            begins=np.asarray(level.cell_offsets[:-1][cells], np.int64),
+            ends=np.asarray(level.cell_offsets[1:][cells], np.int64),
+            rest_mean=np.zeros((last - first, 2)),
+            rest_cov=np.repeat(np.array([[1.0, 0.0, 1.0]]) * window * noise / left, last - first, axis=0),
+            log_factor=log_factor[cells],
         )
+        condition_on_angle(mixture.tubes, measured, Conditioned(log_evidence, at, cov))
         weight[begin:end], mean[begin:end] = np.exp(log_evidence), at[:, :3]
         root[begin:end], definite = cholesky_factors(cov[:, :3, :3] + settings.thickness * np.eye(3))
         # A component without a covariance has no position: it adds to no block, and its weight does not change.

@@ -8,8 +8,9 @@ from pydantic import ValidationError
 from rayfix_service.fusion.measurements.report import Angle, Height, Measurement, Report, TimeOfArrival
 from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportError
 from rayfix_service.wire.documents import HeightDocument
-from rayfix_service.wire.problems import MAX_PROBLEMS, Path, path_text
+from rayfix_service.wire.problems import MAX_PROBLEMS
 from rayfix_tables.errors import ReportError
+from rayfix_tables.problems import Path, path_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +55,7 @@ def adapted_report(
     timestamp: str | None,
     height: Height | None = None,
 ) -> Adapted:
-    """Put measurements and what was left out together.
+    """Combine measurements and what was left out.
 
     Quantised as other systems' are, an angle or an arrival may well come twice; it is then counted once.
 
@@ -78,7 +79,7 @@ def adapted_report(
     repeated: list[Skipped] = []
     for path, measurement in measurements:
         if isinstance(measurement, Angle | TimeOfArrival) and measurement in first:
-            repeated.append(Skipped(path=path, reason=f"says the same as {path_text(first[measurement])}"))
+            repeated.append(Skipped(path=path, reason=f"repeats {path_text(first[measurement])}"))
             continue
         first.setdefault(measurement, path)
         kept.append((path, measurement))
@@ -90,24 +91,24 @@ def adapted_report(
 
 
 def station_of(name: str, *maps: Mapping[str, str] | None) -> str:
-    """Return the station that another system calls `name`: what the first map with it says, else the name itself."""
+    """Return the station that another system calls `name`: by the first map that has it, else the name itself."""
     return next((stations[name] for stations in maps if stations and name in stations), name)
 
 
 def with_height(adapted: Adapted, height: Height | None) -> Adapted:
-    """Add what is known of the target's height to a report that says nothing of it."""
+    """Add the known height of the target to a report without one."""
     if height is None or adapted.report.height is not None:
         return adapted
     return replace(adapted, report=replace(adapted.report, height=height))
 
 
 def error_in_message(error: ReportError, adapted: Adapted) -> InvalidReportError:
-    """Say of an error of the report where in the message it comes from."""
+    """Name in an error of the report the field of the message that it comes from."""
     source: Path = ()
     if len(error.path) > 1 and error.path[0] == "measurements" and isinstance(error.path[1], int):
         source = adapted.sources[error.path[1]]
     unknown = bool(error.path) and error.path[-1] in ("station_id", "reference_station_id")
-    remedy = "; say with stations which one is meant" if unknown else ""
+    remedy = "; give the station in the map stations" if unknown else ""
     text = f"{path_text(source)}: {error}{remedy}" if source else str(error)
     return InvalidReportError((FieldProblem(path=source, message=text),))
 
@@ -132,7 +133,7 @@ def station_map(pairs: Iterable[str]) -> dict[str, str]:
 
 
 def check_stations(stations: Mapping[str, str], known: Collection[str]) -> None:
-    """Refuse a map to stations that a table does not have: it would be noticed with the first message only.
+    """Refuse a map to stations that a table does not have: else only the first message would show the mistake.
 
     Raises
     ------

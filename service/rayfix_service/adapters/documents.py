@@ -1,18 +1,16 @@
 """Checking messages of other formats, with errors in the style of :mod:`rayfix_service.wire`."""
 
-import difflib
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, Field, ValidationError
-from pydantic.fields import FieldInfo
-from pydantic_core import ErrorDetails
+from pydantic import Field, ValidationError
 
-from rayfix_service.wire import FieldProblem, InvalidReportError, WireModel, path_text, read_json
+from rayfix_service.wire import FieldProblem, InvalidReportError, WireModel, read_json
 from rayfix_service.wire.documents import HeightDocument
-from rayfix_service.wire.fields import MISFIT, Rfc3339, misfit
+from rayfix_service.wire.fields import Rfc3339, misfit
 from rayfix_service.wire.limits import has_more_values
-from rayfix_service.wire.problems import Path, invalid_report, shown
+from rayfix_service.wire.problems import invalid_report
+from rayfix_tables.problems import Path
 
 MAX_STATIONS = 1024
 """Names that the map of stations of one message may have."""
@@ -21,7 +19,7 @@ MAX_MESSAGE_VALUES = 50_000
 """Values that the JSON text of a message may have, those that are not read counted."""
 
 _SHORT = 64 << 10
-"""Bytes of a message that is validated without a look at how many values it has."""
+"""Bytes of a message up to which its values are not counted before the validation."""
 
 M = TypeVar("M", bound=WireModel)
 
@@ -69,7 +67,7 @@ def check(
     check_counts: Callable[[Mapping[str, Any]], None] | None = None,
     unwrap: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
 ) -> M:
-    """Validate a message; how much it holds is looked at first.
+    """Validate a message, after a check of its size.
 
     Parameters
     ----------
@@ -104,11 +102,11 @@ def check(
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise invalid_report(error, model, data, lambda detail: _problem(model, detail, what)) from None
+        raise invalid_report(error, model, data, what) from None
 
 
 def too_much(path: Path, text: str) -> InvalidReportError:
-    """Make the error of a message that has too much of something."""
+    """Make the error of a message that exceeds a limit."""
     return InvalidReportError((FieldProblem(path=path, message=text),))
 
 
@@ -129,58 +127,3 @@ def one_of(model: WireModel) -> tuple[str, Any]:
     found = " and ".join(name for name, _ in given) or "nothing"
     names = ", ".join(field.alias or name for name, field in fields.items())
     raise misfit(None, f"holds {found}; give exactly one of {names}")
-
-
-def _problem(root: type[WireModel], error: ErrorDetails, what: str) -> FieldProblem:
-    path, kind, value = error["loc"], error["type"], error["input"]
-    owner, field = _look_up(root, path)
-    if kind == MISFIT:
-        context = error["ctx"]
-        path = path if context["field"] is None else (*path, context["field"])
-        text = context["text"]
-    elif kind in ("extra_forbidden", "invalid_key"):
-        known = [f.alias or name for name, f in owner.model_fields.items()] if owner else []
-        close = difflib.get_close_matches(str(path[-1])[:60], known, n=1, cutoff=0.7)
-        remedy = f"did you mean {close[0]}?" if close else f"leave it out or use one of {', '.join(known)}"
-        text = f"is an unknown key; {remedy}"
-    else:
-        found = "is missing" if kind == "missing" else f"is {shown(value)}"
-        # The description is that of the array, where the path ends in one of its elements.
-        text = f"{found}; give {'a JSON object' if path and isinstance(path[-1], int) else _wanted(field)}"
-    return FieldProblem(path=path, message=f"{path_text(path) or what} {text}")
-
-
-def _wanted(field: FieldInfo | None) -> str:
-    if field is None:
-        return "a JSON object"
-    # For an optional field the description sits inside its annotation.
-    inner = (m.description for a in get_args(field.annotation) for m in getattr(a, "__metadata__", ()))
-    description = field.description or next(inner, None)
-    if description:
-        return description
-    literals = _literals(field.annotation)
-    return f"one of {', '.join(literals)}" if literals else "a JSON object"
-
-
-def _literals(annotation: Any) -> list[str]:
-    return [v for a in get_args(annotation) for v in ([a] if isinstance(a, str) else _literals(a))]
-
-
-def _look_up(root: type[WireModel], path: Path) -> tuple[type[BaseModel] | None, FieldInfo | None]:
-    """Find the model that a path ends in, and its field there; elements of arrays and maps are their field."""
-    owner: type[BaseModel] | None = root
-    field: FieldInfo | None = None
-    inner: type[BaseModel] | None = root
-    for step in path:
-        if isinstance(step, int) or inner is None:
-            continue
-        owner = inner
-        field = next((f for name, f in owner.model_fields.items() if (f.alias or name) == step), None)
-        inner = _model_within(field.annotation) if field else None
-    return owner, field
-
-
-def _model_within(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next((model for a in get_args(annotation) if (model := _model_within(a))), None)

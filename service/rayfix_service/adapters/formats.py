@@ -13,7 +13,7 @@ from rayfix_service.fusion.measurements.report import Height
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report
-from rayfix_service.wire.problems import path_text
+from rayfix_tables.problems import path_text
 from rayfix_tables.site import SiteInfo
 
 InputFormat = Literal["native", "nrppa", "silabs", "ublox"]
@@ -27,7 +27,7 @@ def parse(
     stations: Mapping[str, str] | None = None,
     height: Height | None = None,
 ) -> tuple[Adapted, ...]:
-    """Turn a message into reports: one, or for u-blox lines as many as they tell of.
+    """Turn a message into reports: one, or for u-blox lines one for each transmission.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def parse(
     stations : Mapping, optional
         Stations by the names that the message has for them; the native format has the stations' own.
     height : Height, optional
-        What is known of the target's height, for messages that say nothing of it.
+        Known height of the target, for messages without one.
 
     Raises
     ------

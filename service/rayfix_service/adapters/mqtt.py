@@ -18,8 +18,8 @@ from rayfix_service.adapters.adapted import Adapted
 from rayfix_service.adapters.formats import OutputFormat, write
 from rayfix_service.adapters.omlox_hub import HubSettings, OmloxHub, open_hub
 from rayfix_service.adapters.silabs_stream import SilabsStream
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Frame, Height
+from rayfix_service.locator import Locator
 from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire.names import MAX_NAME, in_log, topic_level
 from rayfix_tables.errors import RayfixError, ReportError
@@ -37,7 +37,7 @@ class BrokerError(RayfixError):
 
 @dataclass(frozen=True, kw_only=True)
 class Broker:
-    """Where the broker is, and who asks."""
+    """Address of the broker, and the credentials for it."""
 
     host: str
     port: int = 1883
@@ -69,7 +69,7 @@ class MqttSettings:
     track : bool
         Whether tags are followed from packet to packet.
     hub : HubSettings or None
-        Omlox hub that is told of all positions as well.
+        Omlox hub that all positions are sent to as well.
     """
 
     topic: str = "silabs/aoa/angle/+/+"
@@ -149,7 +149,7 @@ def topic_for(publish: str, target_id: str) -> str:
 async def run_mqtt(
     locator: Locator, broker: Broker, settings: MqttSettings, *, on_ready: Callable[[], None] | None = None
 ) -> None:
-    """Locate until cancelled; a lost connection is made again, with pauses of 1 to 30 s.
+    """Locate until cancelled; a broken connection is established again, with pauses of 1 to 30 s.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ async def run_mqtt(
     stream = SilabsStream(
         site, window=settings.window, stations=settings.stations, frame=settings.frame, height=settings.height
     )
-    tracker = Tracker(locator.table.scene) if settings.track else None
+    tracker = Tracker(locator.table) if settings.track else None
     async with open_hub(settings.hub) as hub:
         session = _Session(locator=locator, settings=settings, stream=stream, tracker=tracker, hub=hub)
         try:
@@ -179,23 +179,23 @@ async def run_mqtt(
 
 
 async def _run_session(session: "_Session", broker: Broker, on_ready: Callable[[], None] | None) -> None:
-    """Connect, and again when the connection is lost."""
-    place, topic = f"{broker.host}:{broker.port}", session.settings.topic
+    """Connect, and again when the connection breaks."""
+    address, topic = f"{broker.host}:{broker.port}", session.settings.topic
     connected, pause = False, 1.0
     while True:
         try:
             async with _client(broker) as client:
                 await client.subscribe(topic)
                 connected, pause = True, 1.0
-                _log.info("reading '%s' from %s", topic, place)
+                _log.info("reading '%s' from %s", topic, address)
                 if on_ready is not None:
                     on_ready()
                 await _first_of(session.read(client), session.watch(client))
         except (aiomqtt.MqttError, OSError, ValueError) as error:  # ValueError: of a topic that is none
             if not connected:
-                text = f"cannot use the MQTT broker {place} ({error}); check its address and your rights"
+                text = f"cannot use the MQTT broker {address} ({error}); check its address and your rights"
                 raise BrokerError(text) from error
-            _log.warning("lost the broker %s (%s), trying again in %g s", place, in_log(str(error), most=1000), pause)
+            _log.warning("lost the broker %s (%s), trying again in %g s", address, in_log(str(error), most=1000), pause)
         await asyncio.sleep(pause)
         pause = min(2.0 * pause, _LONGEST_PAUSE)
 
@@ -226,7 +226,7 @@ async def _first_of(*coroutines: Coroutine[Any, Any, None]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Session:
-    """What answers packets: the table, and what is remembered from one to the next."""
+    """Locates packets: the table, and the state from one packet to the next."""
 
     locator: Locator
     settings: MqttSettings
@@ -243,7 +243,7 @@ class _Session:
         )
 
     async def read(self, client: aiomqtt.Client) -> None:
-        """Take all messages; one that cannot be read costs nothing but itself."""
+        """Take all messages; one that cannot be read is skipped."""
         async for message in client.messages:
             if isinstance(message.payload, bytes):
                 await self._publish(client, self._receive(message.topic.value, message.payload))
@@ -257,7 +257,7 @@ class _Session:
             return []
 
     async def watch(self, client: aiomqtt.Client) -> None:
-        """End packets that not all locators have heard."""
+        """Complete packets that not all locators have received."""
         while True:
             await asyncio.sleep(0.1 * self.settings.window)
             await self._publish(client, self.stream.due(monotonic()))
@@ -272,7 +272,7 @@ class _Session:
                 _log.info("no position of '%s': %s", target, in_log(str(error), most=1000))
                 continue
             except Exception:
-                # A defect that one packet meets must not end the service.
+                # A defect in one packet's fix must not end the service.
                 self.failed["defect"] += 1
                 _log.exception("a packet of '%s' failed", target)
                 continue
@@ -283,7 +283,7 @@ class _Session:
                 _log.error("a position of '%s' cannot be published: %s", target, error)
 
     def _answer(self, adapted: Adapted) -> dict[str, Any]:
-        """Locate a packet, go on with its tag's track, and tell the hub."""
+        """Locate a packet, update its tag's track, and send the position to the hub."""
         begin = perf_counter()
         fused = self.locator.fuse(adapted.report)
         seconds = perf_counter() - begin

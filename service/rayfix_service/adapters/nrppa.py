@@ -28,8 +28,8 @@ from rayfix_service.adapters.nrppa_documents import (
 from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_interval, time_interval
 from rayfix_service.fusion.measurements.directions import to_scene
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, TimeOfArrival
-from rayfix_service.wire.problems import Path, path_text
 from rayfix_tables.angles import wrap_one
+from rayfix_tables.problems import Path, path_text
 from rayfix_tables.site import Station
 
 _RESOLUTION_M = {"m0dot1": 0.1, "mdot1": 0.1, "m1": 1.0, "m10": 10.0, "m30": 30.0}
@@ -138,7 +138,7 @@ def _array(value: object) -> list[Any] | tuple[Any, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Converter:
-    """Conversion of one TRP's measurements: pairs of a place within the item, and a measurement or a reason."""
+    """Conversion of one TRP's measurements: pairs of a path within the item, and a measurement or a reason."""
 
     document: NrppaDocument
     station_id: str
@@ -241,7 +241,7 @@ def _additional_paths(path: Path, value: UlRtoa | GnbRxTx) -> Iterator[tuple[Pat
 
 
 def _with_line_of_sight(measurement: Angle | Range | TimeOfArrival, los: LosInformation | None) -> Measurement:
-    """Add what the TRP says of a direct path; a hard indicator is a sure one."""
+    """Add the TRP's line-of-sight indicator; a hard one is a probability of 0 or 1."""
     if los is None:
         return measurement
     name, value = one_of(los)

@@ -330,10 +330,12 @@ def unwrapped(message: Mapping[str, Any]) -> Mapping[str, Any]:
     Raises
     ------
     InvalidReportError
-        For a PDU that tells of a failure, or holds another message.
+        For a PDU that reports a failure, or holds another message.
     """
     if FAILURE in message:
-        raise _invalid(FAILURE, "tells that the measurement failed; give a MEASUREMENT RESPONSE or MEASUREMENT REPORT")
+        raise _invalid(
+            FAILURE, "reports that the measurement failed; give a MEASUREMENT RESPONSE or MEASUREMENT REPORT"
+        )
     outcome = next((name for name in OUTCOMES if name in message), None)
     if outcome is None:
         return message

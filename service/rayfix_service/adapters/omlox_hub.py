@@ -1,4 +1,4 @@
-"""Telling an omlox hub of positions (omlox Hub API, version 2: ``PUT /providers/{provider_id}/location``).
+"""Sending positions to an omlox hub (omlox Hub API, version 2: ``PUT /providers/{provider_id}/location``).
 
 Locations wait in lanes, each sent one after the other, so that those of one target keep their order. Nothing here ever
 waits for the hub but the lanes: of a hub that is slow or gone, the oldest locations are dropped.
@@ -26,7 +26,7 @@ from rayfix_tables.site import SiteInfo
 _log = logging.getLogger(__name__)
 
 HubOutcome = Literal["sent", "refused", "dropped"]
-"""What became of a location: the hub took it, said that it never will, or there was no room or patience left."""
+"""Outcome of a location: the hub accepted or refused it, or it was dropped since the queue or the time was used up."""
 
 MAX_ANSWER = 4096
 """Bytes of a hub's answer that are read, for the sake of the connection; nothing of them is used."""
@@ -41,7 +41,7 @@ class HubError(RayfixError):
 
 @dataclass(frozen=True, kw_only=True)
 class HubSettings:
-    """Where the hub is and how patiently it is told.
+    """Address of the hub, and how long sending is attempted.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class OmloxHub:
                 try:
                     outcome = await self._send(client, lane.waiting.popleft())
                 except Exception:
-                    # A defect that one location meets must not end its lane.
+                    # A defect with one location must not end its lane.
                     _log.exception("a location could not be sent")
                 lane.sending = False
                 self._on_outcome(outcome)

@@ -27,6 +27,6 @@ def best_candidate(fix: Fix, track: TrackedPosition | None = None) -> tuple[Cand
     if len(unused) > _MOST_REASONS:
         reasons += f"; and {len(unused) - _MOST_REASONS} more"
     raise ReportError(
-        f"the report gives no position (status '{fix.status}'), and the output format cannot say so; "
+        f"the report gives no position (status '{fix.status}'), and the output format cannot express that; "
         f"ask for the native one to see more{reasons and ': '}{reasons}"
     )

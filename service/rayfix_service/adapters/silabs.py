@@ -1,6 +1,6 @@
 """From the angles of Silicon Labs' Bluetooth locators to a report.
 
-A locator publishes one JSON object per packet that it heard (Bluetooth SDK, ``aoa_serialize_angle``): degrees and
+A locator publishes one JSON object per packet that it received (Bluetooth SDK, ``aoa_serialize_angle``): degrees and
 metres, with the sequence number of the packet. Locator and tag are named by the MQTT topic alone.
 """
 
@@ -15,8 +15,8 @@ from rayfix_service.adapters.documents import KnownHeight, Stations, TargetId, T
 from rayfix_service.fusion.measurements.report import Angle, Frame, Measurement, Range
 from rayfix_service.wire import MAX_MEASUREMENTS, WireModel
 from rayfix_service.wire.fields import misfit
-from rayfix_service.wire.problems import Path
 from rayfix_tables.angles import wrap_one
+from rayfix_tables.problems import Path
 
 _Stdev = Field(ge=0, le=360, description="a standard deviation in degrees, 0 to 360")
 

@@ -21,19 +21,19 @@ _MOST_PACKETS = 20_000
 """Packets that wait for more locators, and that are remembered as ended; beyond that, the oldest end early."""
 
 _MOST_SOURCES = 1000
-"""Locators of which it is remembered that the log tells of them; a broker may have topics without end."""
+"""Locators that are remembered as logged; the number of a broker's topics is not bounded."""
 
 
 class SilabsStream:
     """Takes messages of topics that end in ``<locator>/<tag>``, and gives a report for each packet of a tag.
 
-    A message that cannot be used is passed over and counted; the log tells of the first of each locator. One that is
+    A message that cannot be used is skipped and counted; the first one of each locator is logged. One that is
     delivered twice, as MQTT may with quality of service 1, is taken once.
 
     Parameters
     ----------
     site : SiteInfo
-        Its stations are those that may be heard of; when all have been, a packet's report is complete.
+        Its stations are those that may measure; a packet's report is complete when all have.
     window : float, s
         How long a packet waits for more locators.
     stations : Mapping, optional
@@ -93,7 +93,7 @@ class SilabsStream:
         station_id = station_of(locator, self._stations)
         if station_id not in self._known:
             self._tell(
-                locator, f"station '{in_log(station_id)}' is not in the table; name one, or say which one is meant"
+                locator, f"station '{in_log(station_id)}' is not in the table; name one, or map the locator to one"
             )
             return []
         try:

@@ -1,4 +1,4 @@
-"""Joining what several stations heard of one transmission."""
+"""Joining the measurements of one transmission by several stations."""
 
 import heapq
 from collections.abc import Callable
@@ -16,12 +16,12 @@ _SLACK = 1000
 
 @dataclass(frozen=True, kw_only=True)
 class Transmission(Generic[T]):
-    """What stations heard of one transmission of one target.
+    """Measurements of one transmission of one target.
 
     Attributes
     ----------
     heard : dict
-        What each station heard, by the station's name, in the order of arrival.
+        Measurement of each station, by the station's name, in the order of arrival.
     started : float, s
         When the first of it arrived.
     """
@@ -35,7 +35,7 @@ class Transmission(Generic[T]):
 class Joiner(Generic[T]):
     """Collects messages into transmissions, by sequence number where there is one, else by time.
 
-    A transmission ends when `num_stations` have been heard, when one of its stations is heard again, or
+    A transmission ends when `num_stations` have measured it, when one of its stations measures again, or
     `window` seconds after its first message. A message that comes later than that is dropped; a sequence number
     is taken for a new transmission again after ten windows. The time for a message does not grow with those that
     came before.

@@ -10,11 +10,11 @@ from rayfix_service.adapters.adapted import Adapted, Skipped, adapted_report, st
 from rayfix_service.adapters.transmissions import Joiner, Transmission
 from rayfix_service.fusion.measurements.report import Angle
 from rayfix_service.wire import MAX_REPORTS, FieldProblem, InvalidReportError
-from rayfix_service.wire.problems import Path, shown
 from rayfix_tables.angles import wrap_one
+from rayfix_tables.problems import Path, shown
 
 STDEV_DEG = 5.0
-"""Anchors tell no uncertainty; this is taken for the standard deviation of their angles."""
+"""Anchors give no uncertainty; this is taken for the standard deviation of their angles."""
 
 _PREFIX = "+UUDF:"
 
@@ -47,7 +47,7 @@ class UudfEvent:
     timestamp_ms : int
         Time since the anchor booted; clocks of anchors differ.
     sequence : int or None
-        Periodic advertising sequence number, the same for all anchors; older firmware does not tell it.
+        Periodic advertising sequence number, the same for all anchors; older firmware does not give it.
     """
 
     tag: str
@@ -119,7 +119,7 @@ def parse_ublox(
 ) -> tuple[Adapted, ...]:
     """Turn the lines of several anchors into reports, one for each transmission of each tag.
 
-    Lines with one sequence number belong together. Where there is none, an anchor that tells of a tag again begins
+    Lines with one sequence number belong together. Where there is none, an anchor that reports a tag again begins
     that tag's next report: anchors' clocks differ. In a line, what stands before ``+UUDF:`` is passed over, such as a
     log's time. Lines without it are passed over too, and counted in what the first report skips.
 

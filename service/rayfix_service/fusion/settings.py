@@ -10,20 +10,20 @@ Probability = Annotated[float, Limits(above=0.0, below=1.0)]
 
 @dataclass(frozen=True, kw_only=True)
 class FusionSettings:
-    """What the fusion assumes and how hard it tries.
+    """Assumptions of the fusion, and bounds on its work.
 
     Attributes
     ----------
     outlier_probability : float
         Prior probability that a measurement has nothing to do with the position.
     sight_error : float
-        Least probability that a receiver's judgement whether a path is direct is wrong, however sure it seems.
+        Least probability that a receiver's line-of-sight indication is wrong, whatever the indication is.
     beam_width : int
-        Hypotheses that are kept from one station to the next, before the like are merged.
+        Hypotheses that are kept from one station to the next, before similar ones are merged.
     most_alternatives : int
         Alternatives that are kept of one path of the report, the most probable ones; with clocks, fewer.
     most_considered : int
-        Alternatives that are looked at over all paths of a report, before the improbable are left out. Where the
+        Alternatives that are evaluated over all paths of a report, before the improbable ones are left out. Where the
         combinations of errors that are not Gaussian make more, the less probable ones are left out. A table whose
         stations have very many components allows for more: ``considered_tables`` times those of its largest.
     considered_tables : int
@@ -33,14 +33,15 @@ class FusionSettings:
     max_divergence : float
         What merging two hypotheses may cost, nats.
     component_floor : float
-        Components of a station whose share of its evidence is below this are left out. Since weights are
-        probabilities, so is what this can lose.
+        Components that have less than this fraction of their station's evidence are left out. Since weights are
+        probabilities, it is also about the probability that is left out.
     hypothesis_floor : float
-        Hypotheses whose share of the posterior is below this are left out of the answer.
+        Hypotheses whose posterior probability is below this are left out of the answer.
     ambiguous_below : float
         A best candidate less probable than this makes the fix ``ambiguous``.
     most_rivals : int
-        An ambiguous fix of which not even this many candidates together are that probable is ``insufficient``.
+        An ambiguous fix is ``insufficient`` if its best candidates, at most so many, are together less probable than
+        that.
     insufficient_above : float, m
         A best candidate whose largest standard deviation is above this makes the fix ``insufficient``.
 

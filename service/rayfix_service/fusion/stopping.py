@@ -1,7 +1,7 @@
 """Ending a fix that is under way, from another thread.
 
-A thread cannot be ended from outside. Kernels therefore look at a cell every few milliseconds and return early once it
-is set; what they return then is of no use, so that their callers look at it too, and raise.
+A thread cannot be ended from outside. Kernels therefore read a cell every few milliseconds and return early once it
+is set. Their result is then meaningless, so that their callers check the cell as well and raise.
 """
 
 import numpy as np
@@ -11,23 +11,23 @@ from rayfix_tables.errors import RayfixError
 
 
 class FixStoppedError(RayfixError):
-    """A fix that was told to end before it was done."""
+    """A fix was stopped before it was complete."""
 
 
 class Stop:
-    """Tells a fix that is under way to end.
+    """Stops a fix that is under way.
 
     Attributes
     ----------
     cell : ndarray of uint8, shape (1,)
-        What kernels look at: not 0 once the fix is to end.
+        What kernels read: not 0 once the fix is to end.
     """
 
     def __init__(self) -> None:
         self.cell: NDArray[np.uint8] = np.zeros(1, np.uint8)
 
     def set(self) -> None:
-        """Tell it to end; may be called from any thread."""
+        """Stop the fix; may be called from any thread."""
         self.cell[0] = 1
 
     def check(self) -> None:
@@ -42,4 +42,4 @@ class Stop:
 
 
 NEVER = Stop()
-"""Of fixes that nothing stops. Nobody sets it."""
+"""For fixes that nothing stops; it is never set."""

@@ -4,4 +4,4 @@ from rayfix_tables.errors import RayfixError
 
 
 class ServiceError(RayfixError):
-    """The service cannot start as it is told to."""
+    """The service cannot start with these options."""

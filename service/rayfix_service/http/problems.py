@@ -10,9 +10,10 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
-from rayfix_service.wire import FieldProblem, MalformedJsonError, more_problems, path_text, problems_of
-from rayfix_service.wire.problems import MAX_PROBLEMS
+from rayfix_service.wire import FieldProblem, MalformedJsonError, more_problems, problems_of
+from rayfix_service.wire.problems import MAX_PROBLEMS, parameter_problem
 from rayfix_tables.errors import ReportError
+from rayfix_tables.problems import path_text
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -133,7 +134,7 @@ def report_problem(error: ReportError) -> dict[str, Any]:
 
 
 def internal_problem() -> dict[str, Any]:
-    """Build the document of a defect. It says nothing of the cause, which the log has."""
+    """Build the document of a defect. The cause is in the log only."""
     return problem_document(
         INTERNAL_ERROR, "this is a defect of the service, not of the request; its log has the cause"
     )
@@ -151,7 +152,7 @@ def problem_responses(*kinds: ProblemKind) -> dict[int | str, dict[str, Any]]:
 
 
 def error_response(error: ProblemError | ReportError) -> JSONResponse:
-    """Answer with the problem that an error tells of."""
+    """Answer with the problem document of an error."""
     if isinstance(error, ProblemError):
         return problem_response(problem_document(error.kind, str(error), error.errors), error.headers)
     return problem_response(report_problem(error))
@@ -165,10 +166,7 @@ async def _answer_error(request: Request, error: Exception) -> JSONResponse:
 async def _answer_validation(request: Request, error: Exception) -> JSONResponse:
     """Answer a parameter that FastAPI itself refuses, such as one of a query."""
     assert isinstance(error, RequestValidationError | WebSocketRequestValidationError)
-    errors = [
-        FieldProblem(path=tuple(e["loc"][1:]), message=f"{path_text(tuple(e['loc'][1:]))}: {e['msg']}")
-        for e in error.errors()
-    ]
+    errors = [parameter_problem(detail) for detail in error.errors()]
     listed = errors[:MAX_PROBLEMS]
     return problem_response(problem_document(INVALID_PARAMETER, errors[0].message, listed, len(errors) - len(listed)))
 

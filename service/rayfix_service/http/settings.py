@@ -69,7 +69,7 @@ class ServiceSettings:
     connection_limits : ConnectionLimits
     feed_limits : FeedLimits
     api_keys : pathlib.Path, optional
-        File of the API keys; without it, none is asked for.
+        File of the API keys; without it, none is required.
     reports_per_second : float, optional
         Reports that each key may send a second, on average over ``burst_seconds``.
     burst_seconds : float
@@ -89,16 +89,16 @@ class ServiceSettings:
     table_check : CheckLimits
         Time and memory that the check of a table may take.
     track : bool
-        Whether targets are followed where a request does not say.
+        Whether targets are followed by default, where the request has no parameter for it.
     hub : HubSettings, optional
-        Omlox hub that is told of all positions.
+        Omlox hub that all positions are sent to.
     simulation : bool
         Whether ``POST /v1/simulations`` answers.
     own_process : bool
         Whether the process does nothing else. Its garbage collector then leaves alone what is there once it is ready,
         so that requests wait less for it.
     runtime_folder : pathlib.Path, optional
-        Folder that the workers of one service share; none for a single process.
+        Common folder of the workers of one service; none for a single process.
     """
 
     body_limits: BodyLimits = field(default_factory=BodyLimits)

@@ -72,7 +72,7 @@ class RayfixApp(FastAPI):
         await self._outermost(scope, receive, send)
 
     def surround(self, middleware: Callable[..., ASGIApp], **options: Any) -> None:
-        """Put a middleware around all that there is."""
+        """Put a middleware around all others."""
         self._outermost = middleware(self._outermost, **options)
 
     def openapi(self) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def create_app(
     at_hand : dict of str to ServedTable, optional
         Tables that are verified already, by name; they answer at once. The application takes them out.
     accounts : Accounts, optional
-        Of the clients' rates, which several processes may share.
+        Of the clients' rates, which may be common to several processes.
 
     Raises
     ------
@@ -232,7 +232,7 @@ def _rate_limit(settings: ServiceSettings, accounts: Accounts | None) -> RateLim
 
 
 async def _keep_keys(keys: ApiKeys, seconds: float) -> None:
-    """Read the keys again from time to time; while their file cannot be used, those that were go on."""
+    """Read the keys again from time to time; while their file cannot be used, the previous ones stay valid."""
     failure, is_settled = "", True
     while True:
         await asyncio.sleep(seconds if is_settled else min(seconds, _SECOND_LOOK_SECONDS))
@@ -246,7 +246,7 @@ async def _keep_keys(keys: ApiKeys, seconds: float) -> None:
 
 
 async def _freeze(tables: Tables) -> None:
-    """Let the garbage collector leave alone what is there once the process can locate."""
+    """Exempt all objects from garbage collection once the process is ready."""
     await tables.became_ready.wait()
     gc.collect()
     gc.freeze()

@@ -1,4 +1,4 @@
-"""A way past the router for the route that is asked most."""
+"""A path past the router for the most frequent route."""
 
 from collections.abc import Awaitable, Callable
 
@@ -11,7 +11,7 @@ from rayfix_tables.errors import ReportError
 class FastPath:
     """Middleware that answers one kind of request by itself: POST to a path, without a query.
 
-    To find the route, to work out its parameters and to prepare for what it might need costs FastAPI a good part of
+    FastAPI needs, to find the route, its parameters and its dependencies, a considerable fraction of
     what a fix does. The route itself stays: it answers requests with a query, and makes the OpenAPI document.
 
     Parameters

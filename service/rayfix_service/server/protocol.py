@@ -25,7 +25,7 @@ _SMALL_REST = 1 << 16  # bytes of a body that nobody reads, for which it does no
 _LINGER_SECONDS = 2.0  # for a client that still sends, or that has not read all, when its connection ends
 _LINGER_BYTES = 32 << 20
 _SPARE_SECONDS = 1.0  # for the head of a request, when there are too many connections
-_STOP_SECONDS = 3.0  # for what is under way, when the process is told to end
+_STOP_SECONDS = 3.0  # for requests under way, when the process is to end
 
 # Of the library that reads web sockets.
 _WEBSOCKET_LINE = 8000
@@ -63,7 +63,7 @@ class GatheringTransport:
         self.lingers = False
 
     def __getattr__(self, name: str) -> Any:
-        """Find what is not written here."""
+        """Forward attributes to the transport."""
         return getattr(self._transport, name)
 
     def write(self, data: bytes) -> None:
@@ -233,7 +233,7 @@ class GatheringProtocol(HttpToolsProtocol):
         return bool(lengths) and lengths[0].isdigit() and int(lengths[0]) <= _SMALL_REST
 
     def _close_after_early_answer(self) -> None:
-        """Have an answer that comes before the end of the body say that the connection ends, and end it."""
+        """Announce in an answer before the end of the body that the connection ends, and end it."""
         cycle, send = self.cycle, self.cycle.send
 
         async def send_and_close(message: Any) -> None:
@@ -304,12 +304,12 @@ class GatheringProtocol(HttpToolsProtocol):
         return cycle is not None and not cycle.response_complete
 
     def _last_cycle(self) -> RequestResponseCycle | None:
-        return self.cycle  # None before the first request, which its type does not say
+        return self.cycle  # None before the first request, unlike its type
 
     # --- refusals
 
     def send_400_response(self, msg: str) -> None:
-        """Answer what is no request that this service takes."""
+        """Answer a request that this service does not accept."""
         status, reason, text = self._refusal or (400, "malformed", msg)
         self._refusal = None
         self._refuse(status, reason, text)
@@ -355,7 +355,7 @@ class GatheringProtocol(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         if self.flow.read_paused or (what == "head" and self._is_answering()):
-            # It is not the client that keeps this waiting.
+            # The delay is not the client's.
             self._time(what, seconds)
         elif what == "body":
             self._refuse(408, "body_too_slow", f"the body did not come within {seconds:g} s")
@@ -400,7 +400,7 @@ class SocketProtocol(WebSocketsSansIOProtocol):
     """Web sockets, whose handshakes are refused without a traceback where they are none."""
 
     def handle_parser_exception(self) -> None:
-        """End a connection that sends nonsense."""
+        """End a connection whose data are no valid frames."""
         if self.conn.close_sent is None:  # within the handshake
             self.transport.write(b"HTTP/1.1 400 Bad Request\r\nconnection: close\r\ncontent-length: 0\r\n\r\n")
             self.transport.close()

@@ -38,7 +38,7 @@ _MESSAGES = 2  # times as long as a report may be, a message is answered that it
 _FIGURES_BYTES = 8 << 20  # of some workers
 _OTHER_FILES = 150  # that a worker may have open besides its connections: tables, libraries, pipes, a few spare ones
 _SHUTDOWN_SECONDS = 10  # for requests under way; a full batch takes about one
-_ARRIVING_SECONDS = 0.2  # for requests that are on the way to this process when it is told to end
+_ARRIVING_SECONDS = 0.2  # for requests that are on the way to this process when it is to end
 
 _TRACKS = (
     "each of the %d workers follows targets by itself, and the system chooses who answers a connection: a target's "
@@ -63,7 +63,7 @@ def serve(
     access_log: bool = False,
     settings: ServiceSettings | None = None,
 ) -> None:
-    """Serve tables until the process is told to end (SIGINT, SIGTERM); requests under way are finished.
+    """Serve tables until the process gets SIGINT or SIGTERM; requests under way are finished.
 
     Parameters
     ----------
@@ -74,11 +74,12 @@ def serve(
     port : int
         TCP port; 0 takes a free one, which the log names.
     workers : int
-        Processes that share the port and, since they are forked once the tables are loaded, most of their memory.
+        Processes that listen on the same port and, since they are forked once the tables are loaded, have most of their
+        memory in common.
     log_format : {"text", "json"}
         JSON is an object a line.
     access_log : bool
-        Whether to log a line per request. It costs more than it tells, with a hundred targets at 5 Hz.
+        Whether to log a line per request, which is many with a hundred targets at 5 Hz.
     settings : ServiceSettings, optional
 
     Raises
@@ -136,7 +137,7 @@ def serve(
         if settings.track:
             _log.warning(_TRACKS, workers)
         gc.collect()
-        gc.freeze()  # a collection would write to what the workers share, and so copy it
+        gc.freeze()  # a collection would write to the common memory of the workers, and so copy it
         stack.callback(gc.unfreeze)
         with config.bind_socket() as bound:
             run_workers(
@@ -174,15 +175,15 @@ def _work(config: uvicorn.Config, bound: socket.socket) -> None:
 
 
 def _run(config: uvicorn.Config, *bound: socket.socket) -> None:
-    """Answer requests until the process is told to end."""
+    """Answer requests until the process is to end."""
     server = _Server(config)
     server.run(list(bound) or None)
     if not server.started:
-        raise ServiceError("the service could not start; the log says why")
+        raise ServiceError("the service could not start; the log has the cause")
 
 
 class _Server(uvicorn.Server):
-    """A server that answers what was sent before it was told to end.
+    """A server that answers what was sent before the signal to end.
 
     Such a request may wait in a connection that is not yet accepted or read, and uvicorn would close that.
     """
@@ -201,7 +202,7 @@ class _Server(uvicorn.Server):
 
 @contextmanager
 def _runtime_folder() -> Iterator[Path]:
-    """Make the folder that workers share, with a place for their figures unless the environment names one."""
+    """Make the common folder of the workers, with a folder for their figures unless the environment names one."""
     with ExitStack() as stack:
         try:
             folder = stack.enter_context(runtime_folder())
@@ -210,7 +211,7 @@ def _runtime_folder() -> Iterator[Path]:
                 f"the workers need a temporary folder and there is none ({error.strerror}); set TMPDIR to one"
             ) from None
         if MULTIPROCESS_VARIABLE not in os.environ:
-            # Whichever worker is asked answers for all.
+            # The worker that is asked answers for all.
             (folder / "metrics").mkdir()
             os.environ[MULTIPROCESS_VARIABLE] = str(folder / "metrics")
             stack.callback(os.environ.pop, MULTIPROCESS_VARIABLE)

@@ -1,4 +1,4 @@
-"""Hear that the process was told to end, before its server waits for open streams to end by themselves."""
+"""React to the signal to end before the server waits for open streams to end by themselves."""
 
 import asyncio
 import signal

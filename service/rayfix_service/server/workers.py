@@ -1,4 +1,4 @@
-"""The worker processes of a service: forked from one that holds what they share, and replaced when they die or hang."""
+"""The worker processes of a service: forked from one process, and replaced when they die or hang."""
 
 import logging
 import mmap
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 def run_workers(
     work: Callable[[], None], *, count: int, meanwhile: Callable[[], None], ending: Callable[[], object]
 ) -> None:
-    """Run worker processes until this process is told to end (SIGINT, SIGTERM), then have them end.
+    """Run worker processes until this process gets SIGINT or SIGTERM, then end them.
 
     Workers have all that this process has: its memory is theirs until either writes to it. It must have no other
     thread. They end by themselves when it dies. One that ends is replaced: at once if it had started (see
@@ -43,14 +43,14 @@ def run_workers(
     meanwhile : callable
         What this process does at each look at them, twice a second.
     ending : callable
-        What it does when it has told them to end.
+        Called when it has signalled them to end.
 
     Raises
     ------
     ServiceError
         When none of the first workers can start.
     """
-    # Blocked signals wait to be asked for, and reach no worker before it has handlers of its own.
+    # Blocked signals stay pending, and reach no worker before it has handlers of its own.
     former = signal.pthread_sigmask(signal.SIG_BLOCK, _END)
     starts = _Starts(count=count)
     workers: list[_Worker] = []
@@ -87,11 +87,11 @@ class _Starts:
         self._not_before = 0.0
 
     def may_be_tried(self) -> bool:
-        """Tell whether the pause is over."""
+        """Check whether the pause is over."""
         return time.monotonic() >= self._not_before
 
     def note(self, workers: list["_Worker"]) -> None:
-        """Take in what became of the workers since the last look.
+        """Update the state of the workers since the last check.
 
         Raises
         ------
@@ -108,7 +108,7 @@ class _Starts:
                 self._failed += 1
                 self._not_before = time.monotonic() + min(_LOOK_SECONDS * 2.0**self._failed, _LONGEST_PAUSE_SECONDS)
             if worker.process.exitcode == COULD_NOT_START:
-                self._note_failure(worker.failure or "the log says why")
+                self._note_failure(worker.failure or "the log has the cause")
         others = sum(worker.process.is_alive() for worker in workers)
         if self._reason and not self._any_started and not others and self._failed >= self._count:
             raise ServiceError(f"a worker could not start; {self._reason}")
@@ -123,26 +123,26 @@ _own: "_Worker | None" = None  # in a worker, itself
 
 
 def tell_started() -> None:
-    """Tell the process that forked this one that it does its work; does nothing in a process that is no worker."""
+    """Report to the parent process that this one is ready; does nothing in a process that is no worker."""
     if _own is not None:
         _own.shared[1] = 1
 
 
 def tell_failure(reason: str) -> None:
-    """Tell the process that forked this one why it cannot start, before it ends with ``COULD_NOT_START``."""
+    """Report to the parent process why this one cannot start, before it ends with ``COULD_NOT_START``."""
     if _own is not None:
         text = reason.encode("utf-8", "backslashreplace")[: _FAILURE_BYTES - 1]
-        _own.told[: len(text) + 1] = text + b"\0"
+        _own.report[: len(text) + 1] = text + b"\0"
 
 
 class _Worker:
     """A worker process, as the process that forked it sees it."""
 
     def __init__(self, work: Callable[[], None]) -> None:
-        # Looks are counted and not the time: all processes may be stopped for long together.
+        # Checks are counted and not the time: all processes may be stopped for long together.
         memory = memoryview(mmap.mmap(-1, _SHARED_BYTES + _FAILURE_BYTES))
         self.shared = memory[:_SHARED_BYTES].cast("Q")  # beats, and whether it has started
-        self.told = memory[_SHARED_BYTES:]
+        self.report = memory[_SHARED_BYTES:]
         self.seen_to_start = False
         self._beats_seen = 0
         self._silent_looks = 0
@@ -151,16 +151,16 @@ class _Worker:
 
     @property
     def has_started(self) -> bool:
-        """Whether it has told that it does its work."""
+        """Whether it has reported that it is ready."""
         return self.shared[1] != 0
 
     @property
     def failure(self) -> str:
-        """Why it could not start, if it has told."""
-        return bytes(self.told).partition(b"\0")[0].decode("utf-8", "replace")
+        """Why it could not start, if it has reported that."""
+        return bytes(self.report).partition(b"\0")[0].decode("utf-8", "replace")
 
     def is_well(self) -> bool:
-        """Tell whether the process runs and beats; it has ended otherwise."""
+        """Check whether the process runs and beats; otherwise it has ended."""
         beats = self.shared[0]
         self._silent_looks = self._silent_looks + 1 if beats == self._beats_seen else 0
         self._beats_seen = beats
@@ -187,7 +187,7 @@ def _live(work: Callable[[], None], own: _Worker, parent: int) -> None:
 
 
 def _beat(beats: memoryview, parent: int) -> None:
-    """Tell the parent process that this one runs; end it when there is no parent."""
+    """Report to the parent process that this one runs; end when there is no parent."""
     while os.getppid() == parent:
         beats[0] += 1
         time.sleep(_LOOK_SECONDS)

@@ -1,4 +1,4 @@
-"""What is told of particles: the place where most of them are."""
+"""Summary of the particles: the position of the largest group of them."""
 
 from itertools import product
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def estimate(particles: Particles) -> Estimate:
-    """Mean and covariance of the largest group of particles that hang together."""
+    """Mean and covariance of the largest connected group of particles."""
     mine = largest_group(particles.position)
     position, velocity = particles.position[mine], particles.velocity[mine]
     return Estimate(
@@ -43,7 +43,7 @@ def largest_group(positions: Array) -> NDArray[np.bool_]:
     cells, member, sizes = np.unique(
         np.floor(positions / _REACH).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
-    place = {tuple(cell): n for n, cell in enumerate(cells.tolist())}
+    index = {tuple(cell): n for n, cell in enumerate(cells.tolist())}
     group = np.full(len(cells), -1)
     largest, most = 0, 0
     for start in range(len(cells)):
@@ -55,7 +55,7 @@ def largest_group(positions: Array) -> NDArray[np.bool_]:
             total += int(sizes[n])
             x, y, z = cells[n].tolist()
             for i, j, k in _NEIGHBOURS:
-                neighbour = place.get((x + i, y + j, z + k))
+                neighbour = index.get((x + i, y + j, z + k))
                 if neighbour is not None and group[neighbour] < 0:
                     group[neighbour] = start
                     todo.append(neighbour)

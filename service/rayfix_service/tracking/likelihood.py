@@ -1,10 +1,9 @@
-"""What a report says of the position, apart from what was known before: for multiplying with a track.
+"""The likelihood of the position given a report, without the prior: for multiplying with a track.
 
-A fix is the product of the measurements and of a prior, even in the free space. A track has a prior of its own, its
+A fix is the product of the likelihood and of a prior, uniform over the free space. A track has a prior of its own, its
 prediction, so the fix's is divided out: else the free space, and a known height, would count anew with each report.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +11,10 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import Prior
+from rayfix_tables.gaussians.constants import LOG_2PI
+from rayfix_tables.gaussians.definite import inverses
 
 Array = NDArray[np.float64]
-
-_LOG_2PI = math.log(2.0 * math.pi)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,13 +29,26 @@ class Likelihood:
     mean : ndarray of shape (h, 3), m
     slope : ndarray of shape (h, 3), 1 / m
     information : ndarray of shape (h, 3, 3), 1 / m2
-        May be singular: an azimuth alone says nothing of the height.
+        May be singular: an azimuth alone does not constrain the height.
+    dropped : int
+        Hypotheses that were left out because their covariances are not positive definite.
     """
 
     log_scale: Array
     mean: Array
     slope: Array
     information: Array
+    dropped: int = 0
+
+    def those(self, index: NDArray[np.bool_]) -> "Likelihood":
+        """Return the Gaussians that a mask picks; the others count as dropped."""
+        return Likelihood(
+            log_scale=self.log_scale[index],
+            mean=self.mean[index],
+            slope=self.slope[index],
+            information=self.information[index],
+            dropped=self.dropped + len(index) - int(np.count_nonzero(index)),
+        )
 
     def log_density(self, points: Array) -> Array:
         """Natural logarithm of the likelihood at points of shape (n, 3), m; shape (n,)."""
@@ -55,23 +67,25 @@ def likelihood_of(hypotheses: Hypotheses, prior: Prior, *, height_share: float) 
     prior : Prior
         That they were multiplied with.
     height_share : float
-        Share of what is known of the height that is left in, 0 to 1. All reports of a target tell the same of its
-        height, so that no more than one of them may count in full; see ``TrackingSettings.height_seconds``.
+        Fraction, 0 to 1, of the known height's information that is kept. All reports of a target carry the same height,
+        so that no more than one of them may count in full; see ``TrackingSettings.height_seconds``.
     """
     taken = (1.0 - height_share) * prior.precision
-    information = np.linalg.inv(hypotheses.cov)
-    log_scale = hypotheses.log_weight + 0.5 * np.linalg.slogdet(information)[1] - 1.5 * _LOG_2PI + prior.log_volume
+    information, definite = inverses(hypotheses.cov)
+    information, mean, log_weight = information[definite], hypotheses.mean[definite], hypotheses.log_weight[definite]
+    log_scale = log_weight + 0.5 * np.linalg.slogdet(information)[1] - 1.5 * LOG_2PI + prior.log_volume
     information[:, 2, 2] -= taken
-    slope = np.zeros_like(hypotheses.mean)
+    slope = np.zeros_like(mean)
     if prior.precision > 0.0:
         known = prior.eta / prior.precision
-        from_known = hypotheses.mean[:, 2] - known
+        from_known = mean[:, 2] - known
         # Only what is left of the height lowers the likelihood, and where the height is right it does not.
         log_scale += 0.5 * taken * from_known**2 - 0.5 * prior.eta * known
         slope[:, 2] = taken * from_known
     return Likelihood(
         log_scale=np.append(log_scale, hypotheses.log_all_outlier),
-        mean=np.concatenate([hypotheses.mean, np.zeros((1, 3))]),
+        mean=np.concatenate([mean, np.zeros((1, 3))]),
         slope=np.concatenate([slope, np.zeros((1, 3))]),
         information=np.concatenate([information, np.zeros((1, 3, 3))]),
+        dropped=len(definite) - len(mean),
     )

@@ -6,7 +6,7 @@ The acceleration is white noise of spectral density q. Over a time t the positio
 
 (Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, 6.2.2;
 Stone Soup's ``ConstantVelocity``). Of a particle the position is known and the velocity is Gaussian. Nothing of that
-Gaussian's variance depends on where the particle went, so all particles share it: three numbers.
+Gaussian's variance depends on where the particle went, so it is the same for all particles: three numbers.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class MotionModel:
         Spectral density of the white acceleration along x and y, and along z: after a second the velocity has changed
         by a Gaussian of this variance.
     speed_stdev, vertical_speed_stdev : float, m / s
-        Of each component of the velocity of a target that has just been seen for the first time.
+        Of each component of the velocity of a target that has just been located for the first time.
 
     Raises
     ------

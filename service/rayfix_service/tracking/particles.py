@@ -21,6 +21,7 @@ from rayfix_service.tracking.likelihood import Likelihood
 from rayfix_service.tracking.motion import MotionModel, Step, step_of
 from rayfix_service.tracking.walls import Walls
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.gaussians.definite import cholesky_factors, inverses
 
 _ROUNDS = 8
 """Attempts to find as many particles as are wanted whose ways are not blocked."""
@@ -60,18 +61,27 @@ class Updated:
     particles : Particles
     log_evidence : float
         Natural logarithm of the probability density of the report, given the track before it.
+    dropped : int
+        Hypotheses of the report that were left out because covariances are not positive definite: their own, or those
+        of their products with the prediction.
     """
 
     particles: Particles
     log_evidence: float
+    dropped: int = 0
 
 
 def birth(
     hypotheses: Hypotheses, free_space: FreeSpace, model: MotionModel, count: int, rng: np.random.Generator
 ) -> Particles | None:
-    """Draw particles from a report alone; None where all it says lies in solids."""
-    weight = np.exp(hypotheses.log_weight - hypotheses.log_weight.max())
-    roots = np.linalg.cholesky(hypotheses.cov)
+    """Draw particles from a report alone; None where all of its hypotheses lie in solids.
+
+    A hypothesis whose covariance is not positive definite has no weight; None, too, where there is no other.
+    """
+    roots, definite = cholesky_factors(hypotheses.cov)
+    if not definite.any():
+        return None
+    weight = np.where(definite, np.exp(hypotheses.log_weight - hypotheses.log_weight[definite].max()), 0.0)
     kept = np.empty((0, 3))
     for _ in range(_ROUNDS):
         pick = _systematic(weight, count, rng)
@@ -123,13 +133,15 @@ def update(
     middle = particles.position + seconds * particles.velocity
     # Product of the prediction N(middle, S) with each hypothesis; S is the same for all particles.
     inverse = np.diag(1.0 / step.variance)
-    cov: Array = np.linalg.inv(inverse + likelihood.information).astype(np.float64)
+    cov, definite = inverses(inverse + likelihood.information)
+    if not definite.all():
+        likelihood, cov = likelihood.those(definite), cov[definite]
     log_pair = _pair_evidences(middle, step, likelihood, cov)
     top = float(log_pair.max())
     weight = np.exp(log_pair - top)
     count, alternatives = weight.shape
     log_sum = top + math.log(weight.sum()) - math.log(count)
-    roots = np.linalg.cholesky(cov)
+    roots = cholesky_factors(cov)[0]
 
     def draw(num_kept: int) -> tuple[NDArray[np.int64], Array]:
         origin, chosen = np.divmod(_systematic(weight.ravel(), count, rng), alternatives)
@@ -143,14 +155,18 @@ def update(
     ways = _free_ways(particles, walls, draw, rng)
     if ways is None:
         return None
-    return Updated(particles=_moved(particles, step, ways, middle), log_evidence=log_sum + math.log(ways.free_share))
+    return Updated(
+        particles=_moved(particles, step, ways, middle),
+        log_evidence=log_sum + math.log(ways.free_share),
+        dropped=likelihood.dropped,
+    )
 
 
 def mixed(track: Particles, newborn: Particles, share: float, rng: np.random.Generator) -> Particles:
-    """Replace a share of a track's particles by newborn ones; with all of them, it is a new track.
+    """Replace a fraction of a track's particles by newborn ones; if all are replaced, it is a new track.
 
-    A Gaussian over the velocity is a mixture of narrower ones, so the newborn get velocities drawn from their own and
-    then share the track's variance.
+    A Gaussian over the velocity is a mixture of narrower ones, so the newborn ones get velocities drawn from their own
+    Gaussians and then the track's variance.
     """
     count = len(track)
     num_new = math.floor(share * count + rng.random())
@@ -223,7 +239,7 @@ def _free_ways(
     Parameters
     ----------
     draw : callable
-        Told how many are free so far, draws the origins and ends of as many ways as there are particles.
+        Takes the number of free ways so far and draws the origins and ends of as many ways as there are particles.
     """
     count = len(particles)
     origins, ends, tried = np.empty(0, np.int64), np.empty((0, 3)), 0
@@ -252,8 +268,8 @@ def _moved(particles: Particles, step: Step, ways: _Ways, middle: Array) -> Part
 def _systematic(weight: Array, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Draw indices by weight with one random number (systematic resampling: J. Carpenter et al., 1999)."""
     reached = np.cumsum(weight)
-    places = (np.arange(count) + rng.random()) * (reached[-1] / count)
-    return np.asarray(np.minimum(np.searchsorted(reached, places, side="right"), len(weight) - 1))
+    levels = (np.arange(count) + rng.random()) * (reached[-1] / count)
+    return np.asarray(np.minimum(np.searchsorted(reached, levels, side="right"), len(weight) - 1))
 
 
 def _exactly(found: NDArray[_T], count: int, rng: np.random.Generator) -> NDArray[_T]:

@@ -11,7 +11,7 @@ Count = Annotated[int, Limits(least=1)]
 
 @dataclass(frozen=True, kw_only=True)
 class TrackingSettings:
-    """What the tracking assumes, how hard it tries, and how much it keeps.
+    """Assumptions of the tracking, and bounds on its work and memory.
 
     Attributes
     ----------
@@ -24,13 +24,13 @@ class TrackingSettings:
     longest_gap : float, s
         After a longer time without a report the target is a new one.
     longest_step : float, s
-        Longer times are gone through in steps, so that ways may lead around corners.
+        Longer times are predicted in steps, so that paths may lead around corners.
     height_seconds : float, s
-        What reports tell beforehand of the target's height counts once in this time: they all tell the same.
+        The known height of a target counts once in this time: all of its reports carry the same prior.
     max_targets : int
-        Targets that are kept; of more, those not heard of for longest are forgotten.
+        Targets that are kept; of more, those with the oldest reports are forgotten.
     max_age : float, s
-        Targets not heard of for this time, of the service's own clock, are forgotten.
+        Targets without a report for this time, by the service's own clock, are forgotten.
     seed : int
         Of the random numbers, of which every target has its own.
 

@@ -1,4 +1,4 @@
-"""A target's track as it is told."""
+"""The state of a target's track after a report."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -20,7 +20,7 @@ class Estimate:
     Attributes
     ----------
     probability : float
-        That it is in this place rather than in another one.
+        That the target is at this position rather than at another one.
     position : ndarray of shape (3,), m
     covariance : ndarray of shape (3, 3), m2
     velocity : ndarray of shape (3,), m / s
@@ -44,7 +44,7 @@ class TrackedPosition:
     timestamp : str
         Time that the track is of: that of the last report that it was updated or predicted with.
     num_reports : int
-        Reports since the track's start that said something of the position.
+        Reports since the track's start that constrained the position.
     estimate : Estimate
     regions : CredibleRegions
         Regions around the estimate's position that hold the target with any probability.

@@ -1,4 +1,4 @@
-"""All targets that are followed, and what becomes of a report whose time does not fit."""
+"""The tracks of all targets, and reports whose times are out of order."""
 
 import hashlib
 import math
@@ -10,9 +10,11 @@ from time import monotonic
 
 import numpy as np
 
-from rayfix_service.fusion.locator import Fused
 from rayfix_service.fusion.posterior.credible import CredibleRegions
+from rayfix_service.fusion.posterior.fused import Fused
 from rayfix_service.fusion.posterior.points import ListedPoints
+from rayfix_service.fusion.product.beam import Hypotheses
+from rayfix_service.fusion.product.prior import uniform_prior
 from rayfix_service.measuring.timestamps import utc_moment
 from rayfix_service.tracking.estimate import estimate
 from rayfix_service.tracking.likelihood import likelihood_of
@@ -21,7 +23,7 @@ from rayfix_service.tracking.settings import TrackingSettings
 from rayfix_service.tracking.track import TrackedPosition, TrackState
 from rayfix_service.tracking.walls import walls_of
 from rayfix_tables.errors import ReportError
-from rayfix_tables.table import Scene
+from rayfix_tables.table import Scene, Table
 
 _MOST_HYPOTHESES = 512
 """Of a report, the best are taken in: each meets all particles, and few reports have a quarter as many."""
@@ -36,7 +38,7 @@ class _Track:
     seconds : float
         Time of ``position``, since 1970.
     touched : float, s
-        When the target was last heard of, by the service's clock.
+        Time of the target's last report, by the service's clock.
     strange : float or None
         Time of the last report, if it was long before the track.
     """
@@ -50,24 +52,32 @@ class _Track:
 
 
 class Tracker:
-    """Follows targets through one building. It may be used from several threads.
+    """Follows targets from report to report through one building; it may be used from several threads.
+
+    docs/tracking.md describes the filter.
 
     Parameters
     ----------
-    scene : Scene
-        The table's scene, whose surfaces no target passes.
+    table : Table or Scene
+        Its scene's surfaces block the motion of targets.
     settings : TrackingSettings, optional
     clock : callable, optional
         The service's clock, s, by which targets are forgotten; reports have their own times.
+
+    Attributes
+    ----------
+    dropped : int
+        Hypotheses that updates have left out since their products with a track were singular.
     """
 
     def __init__(
-        self, scene: Scene, settings: TrackingSettings | None = None, *, clock: Callable[[], float] = monotonic
+        self, table: Table | Scene, settings: TrackingSettings | None = None, *, clock: Callable[[], float] = monotonic
     ) -> None:
         self.settings = settings or TrackingSettings()
-        self._walls = walls_of(scene)
+        self._walls = walls_of(table.scene if isinstance(table, Table) else table)
+        self.dropped = 0
         self._clock = clock
-        self._tracks: OrderedDict[str, _Track] = OrderedDict()  # the one heard of last comes last
+        self._tracks: OrderedDict[str, _Track] = OrderedDict()  # the one with the latest report comes last
         self._lock = Lock()
 
     def __len__(self) -> int:
@@ -75,16 +85,34 @@ class Tracker:
         return len(self._tracks)
 
     def warm_up(self) -> None:
-        """Compile the kernels."""
+        """Compile the kernels, by a track of some particles that nobody sees."""
+        settings, free_space, rng = self.settings, self._walls.free_space, np.random.default_rng(0)
         self._walls.passable(np.zeros((1, 3)), np.zeros((1, 3)))
+        free = np.argwhere(free_space.free)
+        if not len(free):
+            return
+        hypotheses = Hypotheses(
+            log_weight=np.zeros(1),
+            mean=free_space.origin + free_space.voxel_size * (free[:1] + 0.5),
+            cov=(0.1 * free_space.voxel_size) ** 2 * np.eye(3)[None],
+            outlier=np.zeros((1, 1), np.int8),
+            log_all_outlier=-50.0,
+        )
+        particles = birth(hypotheses, free_space, settings.motion, 64, rng)
+        assert particles is not None
+        likelihood = likelihood_of(hypotheses, uniform_prior(free_space), height_share=1.0)
+        updated = update(particles, likelihood, settings.motion, 0.1, self._walls, rng)
+        position = _tracked("started", "1970-01-01T00:00:00Z", 1, particles if updated is None else updated.particles)
+        position.regions.upright_ellipsoid(0.5)
+        _ = position.regions.accuracies(0.5).ellipsoid.semi_axes
 
     def follow(self, fused: Fused) -> TrackedPosition | None:
-        """Take a report into its target's track, and tell where the target is.
+        """Update a target's track with a report, and return its position.
 
         Returns
         -------
         TrackedPosition or None
-            None as long as no report has said anything of the position.
+            None as long as no report has constrained the position.
 
         Raises
         ------
@@ -111,7 +139,7 @@ class Tracker:
             return track.position
 
     def _forget(self, now: float) -> None:
-        """Forget targets not heard of for long."""
+        """Forget targets without a report for long."""
         while self._tracks and now - next(iter(self._tracks.values())).touched > self.settings.max_age:
             self._tracks.popitem(last=False)
 
@@ -125,7 +153,7 @@ class Tracker:
         gap = seconds - track.seconds
         if gap <= 0.0:
             # A report that is repeated, or was overtaken. Long before the track, it may be the first after the clock
-            # was set back: the second says so.
+            # was set back, which the second one confirms.
             long_before = gap < -self.settings.longest_gap
             if long_before and track.strange is not None and 0.0 < seconds - track.strange < self.settings.longest_gap:
                 return self._start("restarted", timestamp, seconds, fused, now, track.rng)
@@ -141,7 +169,7 @@ class Tracker:
         particles = self._newborn(fused, rng)
         if particles is None:
             return None
-        position = _told(state, timestamp, 1, particles)
+        position = _tracked(state, timestamp, 1, particles)
         return _Track(particles=particles, position=position, seconds=seconds, touched=now, rng=rng)
 
     def _newborn(self, fused: Fused, rng: np.random.Generator) -> Particles | None:
@@ -156,7 +184,7 @@ class Tracker:
         num_steps = math.ceil(gap / settings.longest_step)
         step = gap / num_steps
         particles: Particles | None = track.particles
-        # The last step is the report's, where it says anything.
+        # The last step is the update, where the report constrains the position.
         for _ in range(num_steps - 1 if fused.hypotheses else num_steps):
             if particles is not None:
                 particles = predict(particles, settings.motion, step, self._walls, rng)
@@ -165,8 +193,8 @@ class Tracker:
             particles, state = self._take_in(particles, fused, step, min(1.0, gap / settings.height_seconds), rng)
         if particles is None:
             return None
-        told = 1 if state == "restarted" else track.position.num_reports + (state == "updated")
-        position = _told(state, timestamp, told, particles)
+        num_reports = 1 if state == "restarted" else track.position.num_reports + (state == "updated")
+        position = _tracked(state, timestamp, num_reports, particles)
         return _Track(particles=particles, position=position, seconds=track.seconds + gap, touched=now, rng=rng)
 
     def _take_in(
@@ -180,6 +208,7 @@ class Tracker:
             updated = update(particles, likelihood, self.settings.motion, step, self._walls, rng)
         if updated is None:
             return self._newborn(fused, rng), "restarted"
+        self.dropped += updated.dropped
         share = self._restart_share(fused.fix.log_evidence - updated.log_evidence)
         newborn = self._newborn(fused, rng) if 2.0 * share * self.settings.num_particles > 1.0 else None
         if newborn is None:
@@ -193,7 +222,7 @@ class Tracker:
         return 1.0 / (1.0 + math.exp(min(-log_ratio - math.log(odds), 700.0)))
 
 
-def _told(state: TrackState, timestamp: str, num_reports: int, particles: Particles) -> TrackedPosition:
+def _tracked(state: TrackState, timestamp: str, num_reports: int, particles: Particles) -> TrackedPosition:
     found = estimate(particles)
     return TrackedPosition(
         state=state,

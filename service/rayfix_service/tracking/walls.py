@@ -5,7 +5,7 @@ tested against the triangles of the cells that its own box touches; ways are sho
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -23,13 +23,11 @@ _MOST_CELLS = 4_000_000
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Walls:
-    """Triangles by cell; make it with :func:`walls_of`.
+class TriangleGrid(NamedTuple):
+    """Triangles by cell.
 
     Attributes
     ----------
-    free_space : FreeSpace
     corners : ndarray of shape (n_triangles, 3, 3), m
     origin : ndarray of shape (3,), m
         Low corner of the grid.
@@ -42,13 +40,26 @@ class Walls:
         Triangles of the cells.
     """
 
-    free_space: FreeSpace
     corners: Array
     origin: Array
     cell: float
     shape: NDArray[np.int64]
     offsets: NDArray[np.int64]
     members: NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Walls:
+    """What targets cannot pass; make it with :func:`walls_of`.
+
+    Attributes
+    ----------
+    free_space : FreeSpace
+    triangles : TriangleGrid
+    """
+
+    free_space: FreeSpace
+    triangles: TriangleGrid
 
     def passable(self, begin: Array, end: Array) -> NDArray[np.bool_]:
         """Whether straight ways cross no surface and end in free space.
@@ -62,7 +73,7 @@ class Walls:
         ndarray of bool, shape (n,)
         """
         out = self.free_space.contains(end)
-        cut_ways(begin, end, self.corners, self.origin, self.cell, self.shape, self.offsets, self.members, out)
+        cut_ways(begin, end, self.triangles, out)
         return out
 
 
@@ -78,15 +89,8 @@ def walls_of(scene: Scene) -> Walls:
     members = np.empty(int(offsets[-1]), np.int64)
     # Each cell's counter runs from the begin of its part to that of the next one's.
     sort_triangles(corners, low, cell, shape, offsets[:-1].copy(), members)
-    return Walls(
-        free_space=scene.free_space,
-        corners=corners,
-        origin=low,
-        cell=cell,
-        shape=shape,
-        offsets=offsets,
-        members=members,
-    )
+    triangles = TriangleGrid(corners=corners, origin=low, cell=cell, shape=shape, offsets=offsets, members=members)
+    return Walls(free_space=scene.free_space, triangles=triangles)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -117,13 +121,12 @@ def sort_triangles(corners: Any, origin: Any, cell: Any, shape: Any, counters: A
 
 
 @numba.njit(cache=True, nogil=True)
-def cut_ways(
-    begin: Any, end: Any, corners: Any, origin: Any, cell: Any, shape: Any, offsets: Any, members: Any, out: Any
-) -> None:
+def cut_ways(begin: Any, end: Any, triangles: Any, out: Any) -> None:
     """Set ``out`` to False where a triangle crosses the straight way, ends included.
 
     T. Moller, B. Trumbore, "Fast, minimum storage ray/triangle intersection", J. Graphics Tools 2 (1), 1997.
     """
+    corners, origin, cell, shape, offsets, members = triangles
     for n in range(len(begin)):
         if not out[n]:
             continue

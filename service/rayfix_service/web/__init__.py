@@ -1,1 +1,1 @@
-"""The viewer in the browser, and what it asks the service for beyond fixes."""
+"""The viewer in the browser, and its routes of the service."""

@@ -54,7 +54,7 @@ class Asset:
         The file, and what gzip makes of it; None where that does not pay.
     media_type : str
     cache_control : str
-        For good where the name has a hash of the content in it, as in all subfolders.
+        Without a time limit where the name contains a hash of the content, as in all subfolders.
     tag : str
         Entity tag.
     """
@@ -77,7 +77,7 @@ def _load(path: Path, folder: Path) -> Asset:
     body = path.read_bytes()
     media_type = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
     if path.suffix == ".js":
-        media_type = "text/javascript"  # whatever the machine's list says
+        media_type = "text/javascript"  # whatever the machine's list of types has
     return Asset(
         body=body,
         compressed=gzip.compress(body, 9, mtime=0) if path.suffix in _COMPRESSIBLE else None,

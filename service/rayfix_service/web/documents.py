@@ -9,16 +9,14 @@ from rayfix_service.fusion.posterior.posterior import Posterior
 from rayfix_service.web.inspector import DirectionView
 from rayfix_service.web.simulation import SimulatedPath
 from rayfix_service.wire import (
-    FieldProblem,
     FixDocument,
-    InvalidReportError,
     Point,
     ReportDocument,
     WireModel,
-    path_text,
     read_json,
 )
 from rayfix_service.wire.points import Matrix
+from rayfix_service.wire.problems import invalid_report
 
 
 class ViewerSettings(BaseModel):
@@ -40,8 +38,8 @@ class CellSummary(BaseModel):
 class ComponentSummary(BaseModel):
     """A component after it was conditioned on the direction."""
 
-    probability: float = Field(description="share of the direction's mixture")
-    log_weight: float = Field(description="natural logarithm of that share")
+    probability: float = Field(description="fraction of the direction's mixture")
+    log_weight: float = Field(description="natural logarithm of that fraction")
     position: Point = Field(description="mean")
     covariance_m2: Matrix
     path_length_m: float
@@ -50,7 +48,7 @@ class ComponentSummary(BaseModel):
 
 
 class MixtureDocument(BaseModel):
-    """What the table says of one direction."""
+    """The mixture of one direction."""
 
     station_id: str
     in_field_of_view: bool
@@ -72,14 +70,14 @@ class LevelCoverage(BaseModel):
     window_deg: float
     num_cells: int
     num_filled_cells: int
-    mass_by_reflections: list[float] = Field(description="share of the level's mass with 0, 1, ... reflections")
+    mass_by_reflections: list[float] = Field(description="fraction of the level's mass with 0, 1, ... reflections")
 
 
 class CoverageDocument(BaseModel):
     """How far the paths of a station reach."""
 
     station_id: str
-    coverage: list[float] = Field(description="share of the free space that at most 0, 1, ... reflections reach")
+    coverage: list[float] = Field(description="fraction of the free space that at most 0, 1, ... reflections reach")
     levels: list[LevelCoverage] = Field(description="finest first")
 
 
@@ -103,7 +101,7 @@ class SimulationRequest(WireModel):
 
 
 class PathSummary(BaseModel):
-    """The path that a station was taken to hear."""
+    """The path that a station was taken to report."""
 
     station_id: str
     azimuth_deg: float
@@ -133,7 +131,7 @@ class PosteriorDocument(BaseModel):
 
     gaussians: list[GaussianSummary] = Field(description="the most probable ones before they are cut to the free space")
     num_gaussians: int
-    prior_share: float = Field(description="probability that the report says nothing of the position")
+    prior_share: float = Field(description="probability that the report does not constrain the position")
     samples: list[Annotated[list[float], Field(min_length=3, max_length=3)]] = Field(
         description="positions drawn from the posterior, m"
     )
@@ -151,13 +149,7 @@ def parse_simulation(body: bytes) -> SimulationRequest:
     try:
         return SimulationRequest.model_validate(data)
     except ValidationError as error:
-        problems = []
-        for detail in error.errors(include_url=False):
-            field = SimulationRequest.model_fields.get(str(detail["loc"][0]) if detail["loc"] else "")
-            hint = f"; give {field.description}" if field is not None and field.description else ""
-            name = path_text(detail["loc"]) or "the document"
-            problems.append(FieldProblem(path=detail["loc"], message=f"{name}: {detail['msg']}{hint}"))
-        raise InvalidReportError(tuple(problems)) from None
+        raise invalid_report(error, SimulationRequest, data, "the document") from None
 
 
 def mixture_document(station_id: str, view: DirectionView, *, most_cells: int = 64) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What the table says of one direction, and how far reflections carry: the data of the table inspector."""
+"""The mixture of one direction, and the reach of reflections: the data of the table inspector."""
 
 from dataclasses import dataclass
 
@@ -32,7 +32,7 @@ class DirectionView:
     log_evidence : float
         Natural logarithm of the density of this direction; -inf where no ray comes from there.
     probability : ndarray of shape (n,)
-        Share of each component, largest first.
+        Fraction of each component, largest first.
     position : ndarray of shape (n, 3), m
     position_cov : ndarray of shape (n, 3, 3), m2
     path_length : ndarray of shape (n,), m
@@ -79,8 +79,8 @@ def view_direction(part: StationPart, azimuth: float, zenith: float, stdev: floa
     rows = np.concatenate([np.arange(begin, end) for begin, end in zip(begins, ends, strict=True)])
     reflections = level.mixture.num_reflections[rows].astype(np.int64)
     log_evidence = float(np.logaddexp.reduce(mixture.log_evidence, initial=-np.inf))
-    share = np.exp(mixture.log_evidence - log_evidence) if len(mixture) else np.empty(0)
-    top = np.argsort(-share, kind="stable")[:limit]
+    fraction = np.exp(mixture.log_evidence - log_evidence) if len(mixture) else np.empty(0)
+    top = np.argsort(-fraction, kind="stable")[:limit]
     return DirectionView(
         in_field_of_view=in_field_of_view(part.station, measured),
         level_index=next(n for n, one in enumerate(part.levels) if one is level),
@@ -89,18 +89,18 @@ def view_direction(part: StationPart, azimuth: float, zenith: float, stdev: floa
         centres=level.grid.centres[lookup.cells],
         cell_components=ends - begins,
         log_evidence=log_evidence,
-        probability=share[top],
+        probability=fraction[top],
         position=mixture.mean[top, :3],
         position_cov=mixture.cov[top, :3, :3],
         path_length=mixture.mean[top, 3],
         path_length_stdev=np.sqrt(mixture.cov[top, 3, 3]),
         num_reflections=reflections[top],
-        by_reflections=np.bincount(reflections, weights=share).astype(np.float64),
+        by_reflections=np.bincount(reflections, weights=fraction).astype(np.float64),
     )
 
 
 def mass_by_reflections(level: Level) -> NDArray[np.float64]:
-    """Share of a level's mass by the number of reflections of its components, shape (k,), summing to 1.
+    """Fraction of a level's mass by the number of reflections of its components, shape (k,), summing to 1.
 
     The mass of a cell is the integral of its measure: volume of free space, weighted by how probably a UE there is
     reported from that direction.

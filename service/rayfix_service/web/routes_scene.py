@@ -1,4 +1,4 @@
-"""Routes of what the viewer shows: the scene, and what the table says of directions."""
+"""Routes for the viewer: the scene, and the mixtures of directions."""
 
 import math
 from typing import Annotated, Any
@@ -28,7 +28,7 @@ router = APIRouter(prefix="/v1", tags=["viewer"])
 _COMPUTED = problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY, TOO_MANY_REQUESTS, OVERLOADED, FIX_TIMEOUT)
 
 _WIDEST_DEG = 30.0
-"""Most standard deviation of a direction whose mixture is told: six of it are all around."""
+"""Largest standard deviation of a direction whose mixture is given: six of it are the whole circle."""
 
 StationId = Annotated[str, Path(max_length=128, description="the identifier of a station of the table")]
 
@@ -92,7 +92,7 @@ async def get_mixture(
 async def get_coverage(
     request: Request, services: ServicesDep, served: TableDep, station_id: StationId
 ) -> JSONResponse:
-    """Tell which share of the free space and of each level's mass belongs to how many reflections.
+    """Give the fractions of the free space and of each level's mass by the number of reflections.
 
     It counts as a report for the rate limit.
     """

@@ -7,7 +7,6 @@ import numpy as np
 from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.stopping import Stop
 from rayfix_service.http.answering.slow_work import Asked_contra, Stoppable
 from rayfix_service.http.openapi.examples import REPORT_EXAMPLES
@@ -21,6 +20,7 @@ from rayfix_service.http.problems import (
     problem_responses,
 )
 from rayfix_service.http.routes.dependencies import ReportBody, ServicesDep, TableDep
+from rayfix_service.locator import Locator
 from rayfix_service.web.documents import (
     PosteriorDocument,
     SimulationDocument,
@@ -47,7 +47,7 @@ SIMULATION_EXAMPLES = {
     "/viewer", summary="What the viewer may do", responses=problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY)
 )
 async def get_viewer_settings(request: Request, services: ServicesDep, served: TableDep) -> ViewerSettings:
-    """Tell what the service allows the viewer, and how long the paths of its table are."""
+    """Give the viewer's settings: whether it may simulate, and the most reflections of a path."""
     return viewer_settings(served.locator.table, simulation=services.settings.simulation)
 
 

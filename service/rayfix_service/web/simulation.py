@@ -1,6 +1,6 @@
-"""Reports of a UE at a given place, made from the table alone.
+"""Reports of a UE at a given position, made from the table alone.
 
-At the place, each component of a station's finest level has a density; the one with the highest stands for the path
+At the position, each component of a station's finest level has a density; the one with the highest stands for the path
 that the station reports, and E[u | x] of it for what a perfect one would measure. That is as true as the table is: a
 forward solver knows paths exactly, but the service has none.
 """
@@ -14,23 +14,24 @@ from numpy.typing import NDArray
 
 from rayfix_tables.angles import wrap
 from rayfix_tables.errors import ReportError
+from rayfix_tables.gaussians.definite import is_definite
 from rayfix_tables.mixture import joint_cov
 from rayfix_tables.table import StationPart, Table
 
 Kind = Literal["aoa", "pt", "toa", "tdoa"]
 
 _NEAREST = 4096
-"""Components whose means are nearest to the place are looked at."""
+"""So many components, whose means are nearest to the position, are considered."""
 
 _REACH = 5.0
-"""A component of which the place is more standard deviations away than this says nothing of it."""
+"""A component from which the position is more standard deviations away than this is left out."""
 
 _CLOCK_RANGE = 300.0  # m, one microsecond
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedPath:
-    """The path by which a station hears a place.
+    """The path from a position to a station.
 
     Attributes
     ----------
@@ -38,6 +39,8 @@ class SimulatedPath:
         From the station towards the incoming ray, in the scene frame.
     path_length : float, m
     num_reflections : int
+    dropped : int
+        Components near the position that were left out because rounding made their covariances singular.
     """
 
     station_id: str
@@ -45,25 +48,32 @@ class SimulatedPath:
     zenith: float
     path_length: float
     num_reflections: int
+    dropped: int = 0
 
 
-def find_path(part: StationPart, place: NDArray[np.float64]) -> SimulatedPath | None:
-    """Path by which a station most probably hears a place; None where it does not.
+def find_path(part: StationPart, position: NDArray[np.float64]) -> SimulatedPath | None:
+    """Most probable path from a position to a station; None where there is none.
 
     Parameters
     ----------
     part : StationPart
-    place : ndarray of shape (3,), m
+    position : ndarray of shape (3,), m
     """
     level = part.levels[0]
     mixture = level.mixture
     if not len(mixture):
         return None
-    apart = ((mixture.x_mean - place.astype(np.float32)) ** 2).sum(axis=1)
+    apart = ((mixture.x_mean - position.astype(np.float32)) ** 2).sum(axis=1)
     near = np.arange(len(apart)) if len(apart) <= _NEAREST else np.argpartition(apart, _NEAREST)[:_NEAREST]
     cov = joint_cov(mixture[near])
+    definite = is_definite(cov[:, 3:, 3:])
+    dropped = len(near) - int(np.count_nonzero(definite))
+    if dropped:
+        near, cov = near[definite], cov[definite]
+        if not len(near):
+            return None
     cross, x_cov = cov[:, :3, 3:], cov[:, 3:, 3:]
-    from_mean = place - mixture.x_mean[near]
+    from_mean = position - mixture.x_mean[near]
     gain = np.linalg.solve(x_cov, from_mean[:, :, None])[:, :, 0]
     square = np.einsum("ni,ni->n", from_mean, gain)
     cell = np.searchsorted(level.cell_offsets, near, side="right") - 1
@@ -81,12 +91,13 @@ def find_path(part: StationPart, place: NDArray[np.float64]) -> SimulatedPath | 
         zenith=float(np.clip(zenith + vertical, 0.0, np.pi)),
         path_length=float(length),
         num_reflections=int(mixture.num_reflections[near[best]]),
+        dropped=dropped,
     )
 
 
 def simulate(
     table: Table,
-    place: Sequence[float],
+    position: Sequence[float],
     *,
     kinds: Sequence[Kind],
     angle_stdev: float,
@@ -97,7 +108,7 @@ def simulate(
 
     Parameters
     ----------
-    place : sequence of 3 floats, m
+    position : sequence of 3 floats, m
     kinds : sequence of str
         What is measured of each path.
     angle_stdev : float, rad
@@ -109,16 +120,16 @@ def simulate(
     Returns
     -------
     paths : list of SimulatedPath
-        Of the stations that hear the place.
+        Of the stations that a path reaches.
     measurements : list of dict
         As ``POST /v1/positions`` takes them.
 
     Raises
     ------
     ReportError
-        When the place is not in the free space or no station hears it.
+        When the position is not in the free space or no path reaches a station.
     """
-    point = np.asarray(place, dtype=np.float64)
+    point = np.asarray(position, dtype=np.float64)
     x, y, z = point
     if not table.scene.free_space.contains(point):
         raise ReportError(
@@ -128,7 +139,8 @@ def simulate(
     paths = [path for part in table.parts.values() if (path := find_path(part, point)) is not None]
     if not paths:
         raise ReportError(
-            f"no station hears position ({x:.2f}, {y:.2f}, {z:.2f}); give one that rays reach", path=("position",)
+            f"no path reaches a station from position ({x:.2f}, {y:.2f}, {z:.2f}); give one that rays reach",
+            path=("position",),
         )
     clock = float(rng.uniform(0.0, _CLOCK_RANGE))
     measurements: list[dict[str, Any]] = []

@@ -1,12 +1,12 @@
-"""What the viewer and the page of a report show, whether a service answers or a file."""
+"""Data for the viewer and for the page of a report, whether from a service or from a file."""
 
 from typing import Any
 
 import numpy as np
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.stopping import NEVER, Stop
+from rayfix_service.locator import Locator
 from rayfix_service.web.documents import ViewerSettings, posterior_document
 from rayfix_tables.table import Table
 
@@ -14,11 +14,11 @@ _SAMPLES = 1500
 
 
 _MAX_REFLECTIONS = 3
-"""Of tables whose site does not say."""
+"""Of tables whose site does not give it."""
 
 
 def viewer_settings(table: Table, *, simulation: bool) -> ViewerSettings:
-    """Gather what the viewer must know beforehand."""
+    """Collect the viewer's settings."""
     propagation = table.site.document.get("propagation", {})
     return ViewerSettings(
         simulation=simulation, max_reflections=int(propagation.get("max_reflections", _MAX_REFLECTIONS))

@@ -1,7 +1,7 @@
 """The JSON of the HTTP interface, and its way to a report and back from a fix.
 
-On the wire an angle is in degrees, a length in metres and a delay in nanoseconds, and each name says so.
-Inside, everything is SI and radians. This package is the only place where the one becomes the other.
+On the wire an angle is in degrees, a length in metres and a delay in nanoseconds, and each name has its unit.
+Inside, everything is SI and radians. Only this package converts between them.
 """
 
 from rayfix_service.wire.documents import (
@@ -17,12 +17,12 @@ from rayfix_service.wire.problems import (
     InvalidReportError,
     MalformedJsonError,
     more_problems,
-    path_text,
     problems_of,
 )
 from rayfix_service.wire.request import parse_report, read_json
 from rayfix_service.wire.response import FixDocument, fix_to_document
 from rayfix_service.wire.writing import report_to_document
+from rayfix_tables.problems import path_text
 
 __all__ = [
     "MAX_MEASUREMENTS",

@@ -10,8 +10,9 @@ from pydantic_core import to_json
 
 from rayfix_service.wire.documents import MAX_REPORTS
 from rayfix_service.wire.limits import MAX_DEPTH, TOKEN
-from rayfix_service.wire.problems import FieldProblem, InvalidReportError, MalformedJsonError, Path, path_text
+from rayfix_service.wire.problems import FieldProblem, InvalidReportError, MalformedJsonError
 from rayfix_service.wire.request import read_json
+from rayfix_tables.problems import Path, path_text
 
 _LONGEST_REST = 64 << 10
 """Bytes that a batch may have beside its reports."""

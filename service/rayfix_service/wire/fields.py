@@ -1,6 +1,6 @@
 """Types of the fields of the request documents.
 
-The description of each field says what the field takes and how to get there; it serves the OpenAPI document
+The description of each field gives its range, and how to convert to it; it serves the OpenAPI document
 and the error messages alike.
 """
 
@@ -112,5 +112,5 @@ LosProbability = Annotated[
     float, _number(0, 1, "the probability that the path is direct, in the receiver's judgement of the signal's shape")
 ]
 
-TailShare = Annotated[float, _number(1e-3, 0.5, "the share of errors that are of the wide part")]
+TailShare = Annotated[float, _number(1e-3, 0.5, "the fraction of errors that are of the wide part")]
 TailScale = Annotated[float, _number(1.5, 20, "how many times wider the wide part is")]

@@ -21,7 +21,7 @@ _DEEPEST = 16
 
 
 def has_more_values(text: bytes, most: int) -> bool:
-    """Tell whether a JSON text has more than so many values; the work is bounded by that number.
+    """Check whether a JSON text has more than so many values; the work is bounded by that number.
 
     An object of n keys and an array of n elements count as n values each, or as 1 when they are empty. What comes after
     too deep a nesting, where the parser ends, does not count.
@@ -46,15 +46,16 @@ def names_of(model: type[BaseModel]) -> frozenset[str]:
     names: set[str] = set()
     for name, field in model.model_fields.items():
         names.add(field.alias or name)
-        for inner in _models_within(field.annotation):
+        for inner in models_within(field.annotation):
             names |= names_of(inner)
     return frozenset(names)
 
 
-def _models_within(annotation: Any) -> tuple[type[BaseModel], ...]:
+def models_within(annotation: Any) -> tuple[type[BaseModel], ...]:
+    """Return the models that an annotation names, at any depth."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return (annotation,)
-    return tuple(model for inner in get_args(annotation) for model in _models_within(inner))
+    return tuple(model for inner in get_args(annotation) for model in models_within(inner))
 
 
 def trimmed(document: object, known: frozenset[str], spare: int) -> Any:

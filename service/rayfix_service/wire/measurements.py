@@ -74,7 +74,7 @@ class _WithErrorModel(WireModel):
 
 
 class _OfOnePath(_WithErrorModel):
-    """Measurement of which the receiver may tell whether the path is direct."""
+    """Measurement that may carry a line-of-sight indication."""
 
     los_probability: LosProbability | None = None
 
@@ -130,11 +130,11 @@ class AngleDocument(_OfOnePath):
 
 
 _Form = tuple[str, ...]
-"""Keys that one way of writing a measurement needs, the deviation last, in the order of the document's fields."""
+"""Keys of one form of a measurement, the standard deviation last, in the order of the document's fields."""
 
 
 class _Forms:
-    """The ways of writing a measurement."""
+    """The forms of a measurement."""
 
     def __init__(self, *forms: _Form) -> None:
         self._forms = frozenset(forms)
@@ -214,7 +214,7 @@ _LONGEST = 1e6
 
 
 class TimeOfArrivalDocument(_OfOnePath):
-    """A time of arrival, with an unknown clock offset that all of a report's times of arrival share."""
+    """A time of arrival, with an unknown clock offset that is common to all times of arrival of a report."""
 
     model_config = ConfigDict(title="TimeOfArrival", json_schema_extra=_ARRIVAL_FORMS.schema)
 
@@ -312,7 +312,7 @@ class SignalStrengthDocument(WireModel):
         return found.path_length, found.log_stdev
 
     def measurement(self) -> LogRange:
-        """Convert to a path length and the deviation of its logarithm."""
+        """Convert to a path length and the standard deviation of its logarithm."""
         length, log_stdev = self._range()
         return LogRange(
             station_id=self.station_id,
@@ -325,7 +325,7 @@ _SHORTEST = 1e-3
 """Shortest path that a signal strength may be of, m."""
 
 _DIGITS = 1e-9
-"""Share of a limit that rounding may be beyond it, where a model's numbers are made of a length at the limit."""
+"""Fraction of a limit by which rounding may exceed it, where a model's numbers are made of a length at the limit."""
 
 _WIDEST_LOG = 1.5
 """Largest standard deviation of a distance's logarithm that the fusion takes: a factor of 4.5."""

@@ -1,4 +1,4 @@
-"""Names are data: one way for each place that a name of a target, station or locator is written to.
+"""Names are data: one way to write a name of a target, station or locator for each kind of output.
 
 A name may hold any character: it comes from a client, a broker or a site file.
 """
@@ -12,7 +12,7 @@ MAX_NAME = 256
 """Characters of a target's name."""
 
 _NO_TOPIC = re.compile(r"[%/+#\x00-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]|^\$")
-"""What means something in an MQTT topic, what a broker may refuse in one, and the sign that escapes them."""
+"""Characters with a meaning in an MQTT topic, those that a broker may refuse, and the escape character."""
 
 
 def path_segment(name: str) -> str:

@@ -1,4 +1,4 @@
-"""What can be wrong with a document, in words that name the field, its value and the remedy.
+"""Errors of a document, with messages that name the field, its value and the remedy.
 
 ::
 
@@ -7,27 +7,23 @@
     └── InvalidReportError      JSON, but not a report; ``problems`` lists all that is wrong
 """
 
-import difflib
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import get_args
+from typing import Any, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from rayfix_service.wire.documents import HeightDocument, ReportDocument
+from rayfix_service.wire.documents import ReportDocument
 from rayfix_service.wire.fields import MISFIT, WireModel
-from rayfix_service.wire.limits import names_of, trimmed
+from rayfix_service.wire.limits import models_within, names_of, trimmed
 from rayfix_service.wire.measurements import MEASUREMENT_DOCUMENTS
 from rayfix_tables.errors import ReportError
+from rayfix_tables.problems import Path, path_text, shown, unknown_key
 
 MAX_PROBLEMS = 50
 """Problems that an error lists; it counts the others. A megabyte of unknown keys must not become megabytes of text."""
-
-_MAX_SHOWN = 60  # characters of a value or a key that a message repeats
-
-Path = tuple[str | int, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,10 +86,10 @@ def invalid_report(
     error: ValidationError,
     model: type[WireModel],
     document: object,
-    problem_of: Callable[[ErrorDetails], FieldProblem],
+    what: str,
     most: int = MAX_PROBLEMS,
 ) -> InvalidReportError:
-    """Say in this project's words what pydantic found wrong with a document.
+    """Translate pydantic's errors of a document into this project's messages.
 
     The time and memory that this takes do not grow with the number of errors, which a megabyte can have 100,000 of.
 
@@ -104,8 +100,8 @@ def invalid_report(
         Model of the document.
     document : object
         The document itself.
-    problem_of : callable
-        Words an error.
+    what : str
+        The document as a whole, in messages.
     most : int
         Problems that the error lists at most, the first ones; the others are counted.
     """
@@ -116,78 +112,95 @@ def invalid_report(
         except ValidationError as fewer:
             error = fewer
     details = error.errors(include_url=False)[:MAX_PROBLEMS]
-    # A misspelt key comes with a missing one; the first message should be the one that says so.
+    # A misspelt key comes with a missing one; the first message should name the misspelt one.
     details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
-    problems = tuple(problem_of(detail) for detail in details[:most])
+    problems = tuple(problem_of(model, detail, what) for detail in details[:most])
     return InvalidReportError(problems, found - len(problems))
 
 
-def path_text(path: Path) -> str:
-    """Write a path as people do: ``measurements[0].azimuth_deg``."""
-    text = ""
-    for step in path:
-        # What is no plain name is quoted, and its control characters with it.
-        plain = isinstance(step, str) and step.isidentifier() and len(step) <= _MAX_SHOWN
-        text += f".{step}" if plain else f"[{step if isinstance(step, int) else repr(_shortened(step))}]"
-    return text.removeprefix(".")
+def problem_of(root: type[WireModel], error: ErrorDetails, what: str) -> FieldProblem:
+    """Translate one of pydantic's errors.
 
-
-def shown(value: object) -> str:
-    """Name a value of a document in a message, briefly and in the words of JSON."""
-    if value is None or isinstance(value, bool):
-        return "null" if value is None else str(value).lower()
-    if isinstance(value, Mapping):
-        return "an object"
-    if isinstance(value, list | tuple):
-        return f"an array of length {len(value)}"
-    if isinstance(value, float) and not math.isfinite(value):
-        return "NaN" if math.isnan(value) else "infinite"
-    if isinstance(value, int) and abs(value) > 10**20:
-        return "a number of more than 20 digits"  # repr fails beyond 4300
-    if isinstance(value, str):
-        return repr(_shortened(value))
-    if isinstance(value, int | float):
-        return repr(value)
-    return f"a Python {type(value).__name__}"
-
-
-def _shortened(text: str) -> str:
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
-
-
-def report_problem_of(error: ErrorDetails) -> FieldProblem:
-    """Word what pydantic found wrong with a report."""
-    path, kind, value, context = error["loc"], error["type"], error["input"], error.get("ctx", {})
-    model: type[WireModel] = ReportDocument
-    if len(path) > 2 and path[0] == "measurements":
-        # pydantic puts the tag of the union into the path; the document has no such step.
-        model, path = MEASUREMENT_DOCUMENTS[str(path[2])], (*path[:2], *path[3:])
-    elif len(path) > 1 and path[0] == "height":
-        model = HeightDocument
+    Parameters
+    ----------
+    root : type of WireModel
+        Model of the document.
+    error : ErrorDetails
+    what : str
+        The document as a whole, in messages.
+    """
+    kind, value, context = error["type"], error["input"], error.get("ctx", {})
+    path, owner, field = _look_up(root, error["loc"])
     if kind == MISFIT:
         path = path if context["field"] is None else (*path, context["field"])
         text = context["text"]
     elif kind in ("extra_forbidden", "invalid_key"):
-        known = list(model.model_fields)
-        close = difflib.get_close_matches(_shortened(str(path[-1])), known, n=1)
-        remedy = f"did you mean {close[0]}?" if close else f"leave it out or use one of {', '.join(known)}"
-        text = f"is an unknown key; {remedy}"
+        text = unknown_key(str(path[-1]), [f.alias or name for name, f in owner.model_fields.items()] if owner else [])
     elif kind in ("union_tag_invalid", "union_tag_not_found"):
         path = (*path, "type")
         found = f"is {shown(value['type'])}" if "type" in value else "is missing"
-        text = f"{found}; give one of {', '.join(MEASUREMENT_DOCUMENTS)}"
-    elif not path:
-        text = f'is {shown(value)}; give a JSON object, e.g. {{"measurements": [...]}}'
-    elif len(path) == 2 and path[0] == "measurements":
-        text = f'is {shown(value)}; give a JSON object, e.g. {{"type": "aoa", "station_id": "bs1", ...}}'
+        text = f"{found}; give one of {', '.join(_tags(field))}"
     else:
         found = "is missing" if kind == "missing" else f"is {shown(value)}"
-        text = f"{found}; give {_description(model, str(path[-1]))}"
-    return FieldProblem(path=path, message=f"{path_text(path) or 'the report'} {text}")
+        text = f"{found}; give {_wanted(root, path, field)}"
+    return FieldProblem(path=path, message=f"{path_text(path) or what} {text}")
 
 
-def _description(model: type[WireModel], name: str) -> str:
-    """Find what a field takes; for an optional field this sits inside its annotation."""
-    field = model.model_fields[name]
+def parameter_problem(error: Mapping[str, Any]) -> FieldProblem:
+    """Translate FastAPI's error of a parameter of a request, for which there is no model."""
+    path = tuple(error["loc"][1:])
+    return FieldProblem(path=path, message=f"{path_text(path)}: {error['msg']}")
+
+
+def _wanted(root: type[WireModel], path: Path, field: FieldInfo | None) -> str:
+    if not path:
+        return 'a JSON object, e.g. {"measurements": [...]}' if root is ReportDocument else "a JSON object"
+    if isinstance(path[-1], int):
+        # The description is that of the array, where the path ends in one of its elements.
+        return 'a JSON object, e.g. {"type": "aoa", "station_id": "bs1", ...}' if _tags(field) else "a JSON object"
+    if field is None:
+        return "a JSON object"
+    # For an optional field the description sits inside its annotation.
     inner = (m.description for a in get_args(field.annotation) for m in getattr(a, "__metadata__", ()))
-    return field.description or next(inner, None) or f"one of {', '.join(get_args(field.annotation))}"
+    description = field.description or next(inner, None)
+    if description:
+        return description
+    literals = _literals(field.annotation)
+    return f"one of {', '.join(literals)}" if literals else "a JSON object"
+
+
+def _literals(annotation: Any) -> list[str]:
+    return [v for a in get_args(annotation) for v in ([a] if isinstance(a, str) else _literals(a))]
+
+
+def _look_up(
+    root: type[WireModel], location: Sequence[str | int]
+) -> tuple[Path, type[BaseModel] | None, FieldInfo | None]:
+    """Find the path in the document, the model that it ends in, and its field there.
+
+    Elements of arrays and maps are their field.
+    """
+    path: list[str | int] = []
+    owner: type[BaseModel] | None = root
+    field: FieldInfo | None = None
+    inner: type[BaseModel] | None = root
+    tags: Mapping[str, type[WireModel]] = {}
+    for step in location:
+        if isinstance(step, str) and step in tags:
+            # pydantic puts the tag of a union into the location; the document has no such step.
+            inner, tags = tags[step], {}
+            continue
+        path.append(step)
+        if isinstance(step, int) or inner is None:
+            continue
+        owner = inner
+        field = next((f for name, f in owner.model_fields.items() if (f.alias or name) == step), None)
+        inner = next(iter(models_within(field.annotation)), None) if field else None
+        tags = _tags(field)
+    return tuple(path), owner, field
+
+
+def _tags(field: FieldInfo | None) -> Mapping[str, type[WireModel]]:
+    """Models by their tags, where a field holds a union that has them."""
+    of_measurements = field is ReportDocument.model_fields["measurements"]
+    return MEASUREMENT_DOCUMENTS if of_measurements else {}

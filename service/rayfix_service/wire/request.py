@@ -16,18 +16,17 @@ from rayfix_service.wire.problems import (
     InvalidReportError,
     MalformedJsonError,
     invalid_report,
-    report_problem_of,
 )
 
 _SHORT = 16 << 10
-"""Bytes of a report that is validated without a look at how many values it has."""
+"""Bytes of a report up to which its values are not counted before the validation."""
 
 
 def read_json(body: bytes) -> object:
-    """Parse a JSON text; a byte order mark before it, as some editors write one, is passed over.
+    """Parse a JSON text; a byte order mark before it, as some editors write one, is skipped.
 
     The literals NaN and Infinity and numbers like 1e400 become floats that are not finite: the model then
-    refuses them at their place, which helps more than "malformed" would.
+    refuses them with their path, which helps more than "malformed" would.
 
     Raises
     ------
@@ -89,4 +88,4 @@ def _validate(data: object, most_problems: int) -> ReportDocument:
     try:
         return ReportDocument.model_validate(document)
     except ValidationError as error:
-        raise invalid_report(error, ReportDocument, document, report_problem_of, most_problems) from None
+        raise invalid_report(error, ReportDocument, document, "the report", most_problems) from None

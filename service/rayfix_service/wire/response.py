@@ -11,7 +11,7 @@ from rayfix_service.wire.track import TrackDocument, track_to_document
 
 
 class CandidateDocument(BaseModel):
-    """One place where the target may be."""
+    """One position that the target may have."""
 
     model_config = ConfigDict(title="Candidate")
 
@@ -21,7 +21,7 @@ class CandidateDocument(BaseModel):
 
 
 class OutcomeDocument(BaseModel):
-    """What became of one measurement."""
+    """Outcome of one measurement."""
 
     model_config = ConfigDict(title="Outcome")
 
@@ -60,7 +60,8 @@ class FixDocument(BaseModel):
     measurements: list[OutcomeDocument]
     simplified: list[str] = Field(
         default=[],
-        description="what was worked out more coarsely than the report says, since the work for one report is bounded; "
+        description="what was worked out more coarsely than the report says, since the work for one report is bounded "
+        "or because rounding made covariances singular; "
         "absent for nearly all reports",
     )
     table_id: str

@@ -15,8 +15,8 @@ class TrackDocument(BaseModel):
 
     state: TrackState = Field(description="what the report did to the track")
     timestamp: str = Field(description="time that the track is of: that of the last report that it took in")
-    num_reports: int = Field(description="reports since its start that said something of the position")
-    probability: float = Field(description="probability that the target is there rather than in another place")
+    num_reports: int = Field(description="reports since its start that constrained the position")
+    probability: float = Field(description="probability that the target is there rather than elsewhere")
     position: Point
     covariance_m2: Matrix = Field(description="covariance of the position, m2, rows in the order x, y, z")
     velocity_m_s: Point = Field(description="velocity, m/s")

@@ -83,7 +83,7 @@ _LEAST = 1e-6
 
 
 def _length(length_key: str, time_key: str, length: float, stdev: float) -> dict[str, float]:
-    """Write a length and its deviation, m; as a time, if the deviation is too small for a length."""
+    """Write a length and its standard deviation, m; as a time, if that is too small for a length."""
     if not stdev < _LEAST:
         return {length_key: length, "stdev_m": stdev}
     return {
@@ -93,7 +93,7 @@ def _length(length_key: str, time_key: str, length: float, stdev: float) -> dict
 
 
 def _range(measurement: Range) -> dict[str, float]:
-    """Write a range; as a round trip, whose deviation may be the smallest, if it is too small for a length."""
+    """Write a range; as a round trip, which allows the smallest standard deviation, if it is too small for a length."""
     if not measurement.stdev < _LEAST:
         return {"range_m": measurement.path_length, "stdev_m": measurement.stdev}
     return {

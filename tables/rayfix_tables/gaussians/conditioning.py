@@ -1,36 +1,21 @@
 """Components of cells conditioned on a measured angle; used by the fusion and by the normalisation."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-LOG_2PI = 1.8378770664093453
+from rayfix_tables.gaussians.constants import LOG_2PI
+
+Array = NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True)
-def condition_on_angle(
-    log_weight: Any,
-    u_mean: Any,
-    u_cov: Any,
-    x_mean: Any,
-    jacobian: Any,
-    x_cov: Any,
-    begins: Any,
-    ends: Any,
-    rest_mean: Any,
-    rest_cov: Any,
-    log_factor: Any,
-    out_log: Any,
-    out_mean: Any,
-    out_cov: Any,
-) -> None:
-    """Condition the components of cells on the rest of the measured angle.
+class MeasuredCells(NamedTuple):
+    """Cells of a level, and what is left of a measured angle beside the window of each.
 
-    Parameters
+    Attributes
     ----------
-    log_weight, u_mean, u_cov, x_mean, jacobian, x_cov : ndarray
-        The ``tubes`` of a :class:`~rayfix_tables.mixture.TubeMixture`. Their covariances are positive definite.
     begins, ends : ndarray of int64, shape (n,)
         Components of cell ``c`` are those from ``begins[c]`` to ``ends[c]``.
     rest_mean : ndarray of shape (n, 2), rad
@@ -38,13 +23,46 @@ def condition_on_angle(
         Packed: horizontal variance, covariance, vertical variance.
     log_factor : ndarray of shape (n,)
         Added to the logarithms of all weights of a cell.
-    out_log : ndarray of shape (k,)
-        Log evidence of each component, cell after cell.
-    out_mean : ndarray of shape (k, 4), m
-        Mean of (x, path length).
-    out_cov : ndarray of shape (k, 4, 4), m2
+    """
+
+    begins: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    rest_mean: Array
+    rest_cov: Array
+    log_factor: Array
+
+
+class Conditioned(NamedTuple):
+    """Gaussians over (x, path length), a row for each component, cell after cell.
+
+    Attributes
+    ----------
+    log_evidence : ndarray of shape (k,)
+    mean : ndarray of shape (k, 4), m
+    cov : ndarray of shape (k, 4, 4), m2
         Positive definite: the position of a component given its ray is nowhere exact.
     """
+
+    log_evidence: Array
+    mean: Array
+    cov: Array
+
+
+@numba.njit(cache=True, nogil=True)
+def condition_on_angle(tubes: Any, cells: Any, out: Any) -> None:
+    """Condition the components of cells on the rest of the measured angle.
+
+    Parameters
+    ----------
+    tubes : Tubes
+        Of a :class:`~rayfix_tables.mixture.TubeMixture`; their covariances are positive definite.
+    cells : MeasuredCells
+    out : Conditioned
+        Filled.
+    """
+    log_weight, u_mean, u_cov, x_mean, jacobian, x_cov = tubes
+    begins, ends, rest_mean, rest_cov, log_factor = cells
+    out_log, out_mean, out_cov = out
     u = np.empty(3)
     cov = np.empty((3, 3))
     cross = np.empty((3, 3))

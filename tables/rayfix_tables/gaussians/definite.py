@@ -39,6 +39,28 @@ def cholesky_factors(cov: Array) -> tuple[Array, NDArray[np.bool_]]:
     return factors, definite
 
 
+def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Inverses of covariances, or of information matrices.
+
+    Parameters
+    ----------
+    matrices : ndarray of shape (n, d, d)
+
+    Returns
+    -------
+    inverses : ndarray of shape (n, d, d)
+        Zero where a matrix or its inverse is not positive definite.
+    definite : ndarray of bool, shape (n,)
+        Whether both are.
+    """
+    definite = is_definite(matrices)
+    found = np.zeros(matrices.shape)
+    found[definite] = np.linalg.inv(matrices[definite])
+    definite[definite] = is_definite(found[definite])
+    found[~definite] = 0.0
+    return found, definite
+
+
 def is_definite(cov: Array) -> NDArray[np.bool_]:
     """Whether covariances of shape (n, d, d) are positive definite, shape (n,)."""
     return cholesky_factors(cov)[1]

@@ -1,9 +1,12 @@
-"""Where compiled kernels are kept when numba would find no place.
+"""Where compiled kernels are kept when numba finds no folder that it can write to.
 
 numba compiles a kernel once and keeps it beside its module, or else in the user's cache folder; ``NUMBA_CACHE_DIR``
-names another place. Where it can write to none of them, as in a read-only container without a home, importing a module
-with kernels fails. The packages with kernels therefore call :func:`ensure_kernel_cache` before they import any. This is
-the only place that changes the process's environment for it, so that worker processes take the same folder.
+names another one. Where it can write to none of them, as in a read-only container without a home, importing a module
+with kernels fails: numba's decorator looks for the folder when it is applied. So this cannot wait for a first call, and
+the three packages with kernels call :func:`ensure_kernel_cache` in their ``__init__``, which Python runs before any of
+their modules, whichever is imported first. ``rayfix_tables`` does not: whoever only reads a table needs no folder.
+Nothing else runs when a package is imported. This is the only module that changes the process's environment for it, so
+that worker processes take the same folder.
 """
 
 import logging

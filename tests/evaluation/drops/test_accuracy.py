@@ -8,7 +8,7 @@ import pytest
 from rayfix_evaluation.drops.accuracy import drop_positions, drops_at, locate_drop, solver_of
 from rayfix_evaluation.drops.bound import position_error_bound
 from rayfix_evaluation.drops.simulate import Noise, Rule
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 
 NOISE = Noise(azimuth_stdev=0.02, zenith_stdev=0.02, range_stdev=0.5)

@@ -11,7 +11,7 @@ from rayfix.example.files import write_example
 from rayfix_evaluation.drops.accuracy import Drop, clear_of_solids, drop_uniformly, locate_drops
 from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
 from rayfix_offline.build import build_table
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Table
 from tests.support.running_app import RunningApp

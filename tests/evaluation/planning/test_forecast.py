@@ -12,7 +12,7 @@ from rayfix_evaluation.drops.simulate import Noise, Timing
 from rayfix_evaluation.planning.floor import slice_mesh
 from rayfix_evaluation.planning.forecast import PlanMap, PlanSettings, draw_places, finite, forecast, summary
 from rayfix_evaluation.planning.picture import changes, draw_comparison, draw_plan
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table
 

@@ -9,7 +9,7 @@ import pytest
 
 from rayfix_service.adapters.formats import InputFormat, OutputFormat, parse, write
 from rayfix_service.adapters.silabs import parse_silabs_angle
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 from tests.support.checkout import ROOT
 

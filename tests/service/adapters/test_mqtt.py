@@ -21,8 +21,8 @@ from rayfix_service.adapters.mqtt import Broker, BrokerError, MqttSettings, chec
 from rayfix_service.adapters.omlox_hub import HubSettings
 from rayfix_service.adapters.silabs import parse_silabs
 from rayfix_service.adapters.silabs_stream import SilabsStream
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Height
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 from tests.support.mqtt_broker import MESSAGE, TAG, Mosquitto, angles, broker_in, exchange, locating
 

@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from rayfix_service.adapters.formats import InputFormat, parse, write
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 
 TARGET = np.array([7.0, 4.0, 1.5])  # m

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import (
     HEAVY_TAILED,
     Angle,
@@ -18,6 +17,7 @@ from rayfix_service.fusion.measurements.report import (
 )
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.locator import Locator
 from rayfix_tables.angles import direction
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import Station, StationBias

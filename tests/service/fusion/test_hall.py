@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report, uniform_drops
 from rayfix_evaluation.truth.forward import ForwardSolver, Paths
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.observations import sort_report
 from rayfix_service.fusion.measurements.report import (
     Angle,
@@ -30,6 +29,7 @@ from rayfix_service.fusion.product.information_form import unpack
 from rayfix_service.fusion.product.prior import Prior, uniform_prior
 from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
 from rayfix_tables.angles import angles_of, direction, local_to_scene
 from rayfix_tables.table import Table

@@ -25,8 +25,9 @@ from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER
 from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.gaussians.conditioning import condition_on_angle
+from rayfix_tables.gaussians.conditioning import Conditioned, MeasuredCells, condition_on_angle
 from rayfix_tables.gaussians.normal_points import unit_points
+from rayfix_tables.gaussians.triangles import triangle
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture, pack, unpack
@@ -89,7 +90,7 @@ def log_integrals(functions: Functions) -> Array:
 def columns_of(gaussians: Functions, times: Times, dimension: int) -> Functions:
     """Functions that Gaussians over (x, path length) and times of arrival become, by the kernel."""
     readings = np.array(list(zip(*times, strict=True)), factor_kernels.READING)
-    columns = np.empty((information_form.triangle(dimension) + dimension + 1, len(gaussians[0])))
+    columns = np.empty((triangle(dimension) + dimension + 1, len(gaussians[0])))
     factor_kernels.to_columns(*gaussians, readings, dimension, columns)
     return information_form.unpack(columns)
 
@@ -107,7 +108,8 @@ def test_condition_on_angle_equals_the_joint_gaussian(dtype: type[np.floating[An
     # Three cells that are not neighbours; the second is empty.
     begins, ends = np.array([5, 3, 0]), np.array([10, 3, 3])
     log_evidence, mean, cov = np.empty(8), np.empty((8, 4)), np.empty((8, 4, 4))
-    condition_on_angle(*stored.values(), begins, ends, rest_mean, rest_cov, log_factor, log_evidence, mean, cov)
+    cells = MeasuredCells(begins, ends, rest_mean, rest_cov, log_factor)
+    condition_on_angle(mixture.tubes, cells, Conditioned(log_evidence, mean, cov))
     for cell, out in ((0, slice(0, 5)), (2, slice(5, 8))):
         expected = kernel_twins.condition_on_angle(
             mixture[begins[cell] : ends[cell]], rest_mean[cell], rest_cov[cell], log_factor[cell]
@@ -123,7 +125,7 @@ def test_condition_on_length_equals_the_joint_gaussian(variance: float) -> None:
     expected = kernel_twins.condition_on_length(log_evidence, mean, cov, 4.0, variance)
     part = np.array([(0, 5, 20, 0.0, 4.0, variance, -1.0, 0, 0)], factor_kernels.PART)[0]
     log, score = np.empty(15), np.empty(15)
-    top = factor_kernels.weigh(log_evidence, mean, cov, part, 0.0, 0.0, log, score)
+    top = factor_kernels.weigh((log_evidence, mean, cov), part, (0.0, 0.0, 0.0), log, score)
     factor_kernels.condition_on_length(mean, cov, 4.0, variance)
     # Evidences of 1e6 nats where a precise length is far off.
     np.testing.assert_allclose(log, expected[0][5:], rtol=1e-11)
@@ -140,7 +142,7 @@ def test_the_score_has_the_evidence_of_a_known_height(variance: float) -> None:
     part = np.array([(0, 0, 20, 0.3, 4.0, variance, 0.0, 0, 0)], factor_kernels.PART)[0]
     log, score = np.empty(20), np.empty(20)
     z, precision = 1.2, 0.3**-2
-    factor_kernels.weigh(*gaussians, part, precision, z * precision, log, score)
+    factor_kernels.weigh(gaussians, part, (0.0, precision, z * precision), log, score)
     if variance < np.inf:
         gaussians = kernel_twins.condition_on_length(*gaussians, 4.0, variance)
     log_norm = 0.5 * (z**2 * precision - np.log(precision / (2.0 * np.pi)))
@@ -247,7 +249,10 @@ def extend_beam(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Products by the kernel, the best first."""
     columns = information_form.pack(*hypotheses), information_form.pack(*factor)
-    parent, choice, score = beam_kernels.extend_beam(*columns, width, hopeless, LOG_VOLUME, LOG_RANGE, NEVER.cell)
+    parent, choice, score, dropped = beam_kernels.extend_beam(
+        *columns, width, hopeless, LOG_VOLUME, LOG_RANGE, NEVER.cell
+    )
+    assert dropped == 0
     order = np.argsort(-score)
     return parent[order], choice[order], score[order]
 

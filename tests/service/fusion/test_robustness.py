@@ -9,7 +9,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import (
     GAUSSIAN,
     HEAVY_TAILED,
@@ -24,6 +23,7 @@ from rayfix_service.fusion.measurements.report import (
     TimeOfArrival,
 )
 from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.locator import Locator
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
 
@@ -146,7 +146,7 @@ def test_any_report_gets_a_sound_fix(locator: Locator, report: Report) -> None:
     else:
         assert_sound(fix, report)
         return
-    assert re.search("contradicts|says the same|too many measurements", str(refusal))
+    assert re.search("contradicts|repeats|too many measurements", str(refusal))
     assert refusal.path[0] == "measurements"
 
 

@@ -7,12 +7,14 @@ from pathlib import Path
 
 CODE = """
 import json, pkgutil, importlib, sys
-import rayfix_service.fusion, rayfix_tables.gaussians.tree_reduction
-from rayfix_service.fusion.locator import Locator
+import rayfix_service.fusion, rayfix_service.tracking, rayfix_tables.gaussians.tree_reduction
+from rayfix_service.locator import Locator
+from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire import parse_report
 from rayfix_tables.table import Table
 
-names = [m.name for m in pkgutil.walk_packages(rayfix_service.fusion.__path__, "rayfix_service.fusion.")]
+packages = rayfix_service.fusion, rayfix_service.tracking
+names = [m.name for p in packages for m in pkgutil.walk_packages(p.__path__, p.__name__ + ".")]
 modules = [rayfix_tables.gaussians.tree_reduction, *(importlib.import_module(name) for name in names)]
 
 def compiled():
@@ -21,10 +23,16 @@ def compiled():
 
 locator = Locator(Table.open(sys.argv[1]))
 locator.warm_up()
+tracker = Tracker(locator.table)
+tracker.warm_up()
 warm = compiled()
 for document in json.loads(sys.argv[2]):
     fix = locator.locate(parse_report(document))
     fix.regions.ellipsoid(0.9)
+for second, document in enumerate(json.loads(sys.argv[2])):
+    timed = {**document, "target_id": "a", "timestamp": f"2026-01-31T10:00:0{second}Z"}
+    track = tracker.follow(locator.fuse(timed))
+    track.regions.ellipsoid(0.9), track.regions.upright_ellipsoid(0.9), track.regions.accuracies(0.9)
 print(json.dumps([sum(warm.values()), [f"{m}.{n}" for (m, n), k in compiled().items() if k != warm[m, n]]]))
 """
 

@@ -113,7 +113,7 @@ def test_workers_whose_service_is_killed_end_by_themselves():
 def test_workers_none_of_which_can_start_end_the_service():
     with service(RUN.format(work="sys.exit(workers.COULD_NOT_START)")) as run:
         pids = [run.worker(), run.worker()]
-        run.read("ServiceError: a worker could not start; the log says why")
+        run.read("ServiceError: a worker could not start; the log has the cause")
         assert run.process.wait(10) != 0
         assert all(ends(pid) for pid in pids)
 

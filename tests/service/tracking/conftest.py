@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.locator import Fused
 from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.fusion.posterior.fused import Fused
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import Prior, uniform_prior
 from rayfix_service.tracking.likelihood import Likelihood, likelihood_of

@@ -4,6 +4,7 @@ Tolerances are five standard errors of the means over the particles.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_prior
 from rayfix_service.tracking.likelihood import Likelihood, likelihood_of
 from rayfix_service.tracking.motion import MotionModel
-from rayfix_service.tracking.particles import Particles, birth, mixed, predict, update
+from rayfix_service.tracking.particles import Particles, Updated, birth, mixed, predict, update
 from rayfix_service.tracking.walls import walls_of
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Scene
@@ -174,3 +175,75 @@ def test_newborn_particles_keep_their_velocities_variance(
     assert spread == pytest.approx(model.first_velocity_variance, rel=0.1)
     assert mixed(track, newborn, 1e-9, rng) is track
     assert mixed(track, newborn, 1.0 - 1e-9, rng) is newborn
+
+
+BROKEN = {"indefinite": np.diag([0.04, -0.04, 0.04]), "singular": np.zeros((3, 3)), "nan": np.full((3, 3), np.nan)}
+
+
+def with_a_broken_one(hypotheses: Hypotheses, kind: str) -> Hypotheses:
+    """Take the covariance of the second hypothesis away."""
+    cov = hypotheses.cov.copy()
+    cov[1] = BROKEN[kind]
+    return replace(hypotheses, cov=cov)
+
+
+@pytest.mark.parametrize("kind", sorted(BROKEN))
+def test_no_particle_is_born_of_a_hypothesis_without_a_covariance(
+    free_space: FreeSpace, make_hypotheses: Callable[..., Hypotheses], kind: str
+):
+    found = birth(
+        with_a_broken_one(make_hypotheses([[1.0, 0.0, 0.0], [9.0, 0.0, 0.0]], probabilities=[0.1, 0.9]), kind),
+        free_space,
+        MODEL,
+        200,
+        np.random.default_rng(5),
+    )
+    assert found is not None
+    assert np.all(found.position[:, 0] < 5.0)
+
+
+@pytest.mark.parametrize("kind", sorted(BROKEN))
+def test_nothing_is_born_where_no_hypothesis_has_a_covariance(
+    free_space: FreeSpace, make_hypotheses: Callable[..., Hypotheses], kind: str
+):
+    hypotheses = make_hypotheses([[1.0, 0.0, 0.0]])
+    hypotheses = replace(hypotheses, cov=BROKEN[kind][None])
+    assert birth(hypotheses, free_space, MODEL, 200, np.random.default_rng(5)) is None
+
+
+@pytest.mark.parametrize("kind", sorted(BROKEN))
+def test_an_update_leaves_out_hypotheses_without_a_covariance(
+    open_scene: Scene, free_space: FreeSpace, make_hypotheses: Callable[..., Hypotheses], kind: str
+):
+    rng = np.random.default_rng(6)
+    hypotheses = make_hypotheses([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    whole = replace(hypotheses, log_weight=hypotheses.log_weight[:1], mean=hypotheses.mean[:1], cov=hypotheses.cov[:1])
+    prior, particles = uniform_prior(free_space), cloud(rng, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+
+    def updated(report: Hypotheses) -> Updated:
+        likelihood = likelihood_of(report, prior, height_share=0.0)
+        found = update(particles, likelihood, MODEL, 0.5, walls_of(open_scene), np.random.default_rng(7))
+        assert found is not None
+        return found
+
+    found, expected = updated(with_a_broken_one(hypotheses, kind)), updated(whole)
+    assert (found.dropped, expected.dropped) == (1, 0)
+    assert found.log_evidence == expected.log_evidence
+    np.testing.assert_array_equal(found.particles.position, expected.particles.position)
+
+
+def test_an_update_leaves_out_products_that_are_singular(open_scene: Scene, even_likelihood: Callable[..., Likelihood]):
+    """Where a known height is divided out, rounding may leave a negative information that outweighs the prediction."""
+    likelihood = even_likelihood([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]], 0.1)
+    information = likelihood.information.copy()
+    information[1, 2, 2] = -1e6  # 1 / m2
+    rng = np.random.default_rng(6)
+    particles = cloud(rng, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    broken = replace(likelihood, information=information)
+    found = update(particles, broken, MODEL, 0.5, walls_of(open_scene), np.random.default_rng(7))
+    whole = likelihood.those(np.array([True, False, True]))
+    expected = update(particles, whole, MODEL, 0.5, walls_of(open_scene), np.random.default_rng(7))
+    assert found is not None
+    assert expected is not None
+    assert found.dropped == 1
+    np.testing.assert_array_equal(found.particles.position, expected.particles.position)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rayfix_service.fusion.locator import Fused
+from rayfix_service.fusion.posterior.fused import Fused
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.tracking.estimate import largest_group
 from rayfix_service.tracking.settings import TrackingSettings

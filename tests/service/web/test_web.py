@@ -3,7 +3,7 @@
 import asyncio
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ import pytest
 import trimesh
 
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.http.answering.table_cache import TableCache
+from rayfix_service.locator import Locator
 from rayfix_service.web import assets
 from rayfix_service.web.documents import MixtureDocument, mixture_document
 from rayfix_service.web.glb import NO_MATERIAL, write_glb
@@ -169,6 +169,23 @@ def test_a_simulated_path_is_one_of_the_forward_solvers(table: Table):
         assert np.any((apart < 0.5) & (off < 0.1) & (exact.num_reflections == path.num_reflections)), station_id
 
 
+def test_a_simulated_path_is_of_no_component_without_a_covariance(table: Table):
+    part = table.parts["bs1"]
+    (finest, *others), place = part.levels, np.array(EXAMPLE_POSITION)
+    whole = find_path(part, place)
+    assert whole is not None
+    broken = finest.mixture.x_cov.copy()
+    jacobian = finest.mixture.jacobian.copy()
+    broken[::2], jacobian[::2] = 0.0, 0.0
+    mixture = replace(finest.mixture, x_cov=broken, jacobian=jacobian)
+    found = find_path(replace(part, levels=(replace(finest, mixture=mixture), *others)), place)
+    assert found is not None
+    assert whole.dropped == 0
+    assert 0 < found.dropped < len(mixture)
+    mixture = replace(mixture, x_cov=np.zeros_like(broken), jacobian=np.zeros_like(jacobian))
+    assert find_path(replace(part, levels=(replace(finest, mixture=mixture), *others)), place) is None
+
+
 def test_a_simulation_is_located_where_it_was(web: RunningApp):
     wanted = {"position": list(EXAMPLE_POSITION), "angle_stdev_deg": 0.25, "range_stdev_m": 0.1, "seed": 3}
     document = web.post("/v1/simulations", wanted).json()
@@ -298,3 +315,46 @@ def test_results_of_tables_are_computed_once():
         return [calls.count(name) for name in "abc"]
 
     assert asyncio.run(ask()) == [2, 1, 1]  # "a" was the oldest when "c" came
+
+
+def test_requests_at_the_same_time_wait_for_one_result():
+    async def ask() -> tuple[list[object], list[str]]:
+        kept, calls, may_end = TableCache(), list[str](), asyncio.Event()
+
+        async def run(compute: Callable[[], str]) -> str:
+            calls.append("a")
+            await may_end.wait()
+            return compute()
+
+        tasks = [asyncio.create_task(kept.get("table", "a", lambda: "result", run)) for _ in range(4)]
+        await asyncio.sleep(0)
+        tasks[0].cancel()  # the client that came first is gone; the others get their result
+        await asyncio.sleep(0)
+        may_end.set()
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+        assert await kept.get("table", "a", lambda: "another", run) == "result"
+        return results, calls
+
+    (gone, *results), calls = asyncio.run(ask())
+    assert isinstance(gone, asyncio.CancelledError)
+    assert results == ["result"] * 3
+    assert calls == ["a"]
+
+
+def test_a_failed_result_is_computed_anew():
+    async def ask() -> tuple[list[object], str]:
+        kept, failures = TableCache(), [ValueError("once")]
+
+        async def run(compute: Callable[[], str]) -> str:
+            await asyncio.sleep(0)
+            if failures:
+                raise failures.pop()
+            return compute()
+
+        both = [kept.get("table", "a", lambda: "result", run) for _ in range(2)]
+        failed = await asyncio.gather(*both, return_exceptions=True)
+        return failed, await kept.get("table", "a", lambda: "result", run)
+
+    failed, result = asyncio.run(ask())
+    assert [str(error) for error in failed] == ["once", "once"]
+    assert result == "result"

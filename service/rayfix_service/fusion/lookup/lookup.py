@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from rayfix_service.fusion.lookup.partition_of_unity import sum_of_ellipse, sum_of_meridian
 from rayfix_service.fusion.measurements.directions import Direction
 from rayfix_tables.angles import wrap
+from rayfix_tables.gaussians.constants import LOG_2PI
 from rayfix_tables.level import WINDOW_RATIO, Level
 
 _SUM_REACH = 3.0
@@ -36,9 +37,6 @@ _LEAST_CORRELATION = 1e-3
 
 _MERIDIAN_WINDOW = float(np.deg2rad(4.0))
 """Narrower windows are not summed along a tilted meridian, which is straight enough over these."""
-
-_LOG_2PI = float(np.log(2.0 * np.pi))
-
 
 SUM_RATIO = 1.6
 """Noise up to this many times what a window serves is looked up in the sum of some ten cells.
@@ -122,7 +120,7 @@ def _single_cell(level: Level, cell: int, offset: tuple[float, float], noise: tu
     g_h, g_v = (d_vv * a_h + hv * a_v) / det, (hv * a_h + d_hh * a_v) / det
     scale = window / det
     rest = [(d_vv * hh + hv * hv) * scale, window * hv * scale, (d_hh * vv + hv * hv) * scale]
-    log_factor = _LOG_2PI + 2.0 * math.log(window) - 0.5 * math.log(det) + 0.5 * (a_h * g_h + a_v * g_v)
+    log_factor = LOG_2PI + 2.0 * math.log(window) - 0.5 * math.log(det) + 0.5 * (a_h * g_h + a_v * g_v)
     mean = [window * g_h, window * g_v]
     return Lookup(level, np.array([cell]), np.array([mean]), np.array([rest]), np.array([log_factor]))
 
@@ -209,9 +207,9 @@ def _remainder(
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """``R_rest``, ``a_rest`` and log f along one axis, where W is ``window``."""
     left = window - variance
-    log_factor = 0.5 * (_LOG_2PI + 2.0 * np.log(window) - np.log(left) + offset**2 / left)
+    log_factor = 0.5 * (LOG_2PI + 2.0 * np.log(window) - np.log(left) + offset**2 / left)
     return window * variance / left, window * offset / left, log_factor
 
 
 def _log_normal(offset: NDArray[np.float64], variance: float) -> NDArray[np.float64]:
-    return np.asarray(-0.5 * (offset**2 / variance + np.log(variance) + _LOG_2PI))
+    return np.asarray(-0.5 * (offset**2 / variance + np.log(variance) + LOG_2PI))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.angles import angles_of, direction, tangent, wrap
+from rayfix_tables.gaussians.constants import LOG_2PI
 from rayfix_tables.grid import AngularGrid
 
 _REACH = 3.5
@@ -19,8 +20,6 @@ _REACH = 3.5
 
 _ACROSS = 30.0
 """Standard deviation, rad, that stands for no knowledge along a meridian."""
-
-_LOG_2PI = float(np.log(2.0 * np.pi))
 
 Array = NDArray[np.float64]
 
@@ -104,7 +103,7 @@ def sum_of_meridian(grid: AngularGrid, window: float, azimuth: float, stdev: flo
         cells,
         (sine * apart)[cells, None] * along,
         rest_cov,
-        _log_area(grid)[cells] + np.log(sine[cells]) + 0.5 * _LOG_2PI + np.log(_ACROSS),
+        _log_area(grid)[cells] + np.log(sine[cells]) + 0.5 * LOG_2PI + np.log(_ACROSS),
     )
 
 

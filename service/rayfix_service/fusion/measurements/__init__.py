@@ -1,1 +1,1 @@
-"""What a report says: measurements, their error models, clocks and directions."""
+"""The content of a report: measurements, their error models, clocks and directions."""

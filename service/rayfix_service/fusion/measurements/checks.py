@@ -1,8 +1,10 @@
 """Checks of a report that was built in Python; one that comes as JSON is checked while it is read."""
 
 import math
+import sys
 
 from rayfix_service.fusion.measurements.report import (
+    GAUSSIAN,
     Angle,
     ErrorModel,
     Height,
@@ -15,6 +17,7 @@ from rayfix_service.fusion.measurements.report import (
 )
 from rayfix_tables.errors import ReportError
 from rayfix_tables.limits import Limits
+from rayfix_tables.problems import path_text
 
 _FINITE = Limits()
 _STDEV = Limits(above=0.0)
@@ -39,6 +42,27 @@ _LIMITS: dict[type, dict[str, Limits]] = {
     Report: {"confidence": Limits(above=0.0, below=1.0)},
 }
 _OPTIONAL = frozenset({"zenith", "zenith_stdev", "los_probability"})
+
+
+def _closed(limits: Limits) -> tuple[float, float]:
+    """Least and greatest number of a range."""
+    low, high = -sys.float_info.max, sys.float_info.max
+    if limits.least is not None:
+        low = limits.least
+    if limits.above is not None:
+        low = max(low, math.nextafter(limits.above, math.inf))
+    if limits.most is not None:
+        high = limits.most
+    if limits.below is not None:
+        high = min(high, math.nextafter(limits.below, -math.inf))
+    return low, high
+
+
+_FIELDS = {
+    kind: [(name, *_closed(limits), limits) for name, limits in ranges.items()] for kind, ranges in _LIMITS.items()
+}
+"""Name, least number, greatest number and range of each field: comparing with two numbers is what takes least."""
+
 _KINDS = "an Angle, a Range, a LogRange, a TimeOfArrival or a TimeDifference"
 
 
@@ -62,7 +86,7 @@ def check_report(report: Report) -> Report:
         if not isinstance(measurement, Measurement):
             raise ReportError(f"measurements[{index}] is {measurement!r}; give {_KINDS}", path=path)
         _check(measurement, path)
-        if not isinstance(measurement, LogRange):
+        if not isinstance(measurement, LogRange) and measurement.error_model is not GAUSSIAN:
             _check(measurement.error_model, (*path, "error_model"))
         if isinstance(measurement, Angle) and (measurement.zenith is None) != (measurement.zenith_stdev is None):
             missing = "zenith" if measurement.zenith is None else "zenith_stdev"
@@ -71,18 +95,17 @@ def check_report(report: Report) -> Report:
 
 
 def _check(part: object, path: tuple[str | int, ...]) -> None:
-    for name, limits in _LIMITS[type(part)].items():
+    for name, low, high, limits in _FIELDS[type(part)]:
         value = getattr(part, name)
         if value is None and name in _OPTIONAL:
             continue
         try:
-            within = limits.hold(value)
-        except TypeError:
+            within = low <= value <= high
+        except (TypeError, ValueError):
             within = False
         if not within:
             _refuse((*path, name), value, f"a finite number {limits}".rstrip())
 
 
 def _refuse(path: tuple[str | int, ...], value: object, wanted: str) -> None:
-    text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).removeprefix(".")
-    raise ReportError(f"{text} is {value!r}; give {wanted}", path=path)
+    raise ReportError(f"{path_text(path)} is {value!r}; give {wanted}", path=path)

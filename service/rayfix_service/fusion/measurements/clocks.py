@@ -1,6 +1,6 @@
-"""Times of arrival on clocks of which nobody knows the offset, and time differences turned into such times.
+"""Times of arrival on clocks of unknown offset, and time differences turned into such times.
 
-A set of time differences between stations says as much as times of arrival at these stations on a clock of its own.
+A set of time differences between stations is equivalent to times of arrival at these stations on a clock of its own.
 Stations that differences connect, over however many steps, are on one clock: then it does not matter which station
 is the reference of which, and the noise that two differences share through a station is correlated as it is.
 """
@@ -16,7 +16,7 @@ from rayfix_service.fusion.measurements.likelihood import ONE_GAUSSIAN, Spread, 
 from rayfix_service.fusion.measurements.report import GAUSSIAN, ErrorModel
 from rayfix_tables.errors import ReportError
 
-ALONE = "a time of arrival from one station only says nothing: the UE's clock is unknown"
+ALONE = "a time of arrival from a single station does not constrain the position: the UE's clock is unknown"
 FAR = "the time is farther from the others of its clock than any path is long"
 
 _CONTRADICTION = 5.0
@@ -49,9 +49,9 @@ class Arrival:
     Attributes
     ----------
     index : int or None
-        Place in the report; None for one that time differences stand for.
+        Index in the report; None for one that time differences are equivalent to.
     differences : tuple of int
-        Places of those differences.
+        Indices of those differences.
     """
 
     station_id: str
@@ -83,7 +83,7 @@ class Clocks:
     readings : tuple of (Arrival, ClockReading)
     num_clocks : int
     unused : mapping of int to str
-        Why measurements could not be used, by their places in the report.
+        Why measurements could not be used, by their indices in the report.
     """
 
     readings: tuple[tuple[Arrival, ClockReading], ...]
@@ -107,7 +107,7 @@ def read_clocks(clocks: Sequence[Sequence[Arrival]], max_path_length: float) -> 
         if len({row.station_id for row in near}) < 2:
             near = []
         without_effect = _without_effect(clock, near)
-        # A difference between two lost arrivals may connect those that are left, all of which then hang on it.
+        # A difference between two dropped arrivals may connect those that are left, all of which then depend on it.
         own = without_effect.union(*(row.differences for row in near))
         linking = tuple(sorted({index for row in clock for index in row.differences} - own))
         for row in near:
@@ -122,15 +122,15 @@ def read_clocks(clocks: Sequence[Sequence[Arrival]], max_path_length: float) -> 
 
 
 def _without_effect(clock: Sequence[Arrival], near: Sequence[Arrival]) -> set[int]:
-    """Places of the measurements of a clock that connect none of the arrivals near each other."""
+    """Find the measurements of a clock that connect none of the arrivals near each other, by their indices."""
     kept = {(row.index, row.station_id) for row in near}
-    lost = [row for row in clock if (row.index, row.station_id) not in kept]
-    dropped = {row.index for row in lost if row.index is not None}
+    removed = [row for row in clock if (row.index, row.station_id) not in kept]
+    dropped = {row.index for row in removed if row.index is not None}
     if not near:
         return dropped.union(*(row.differences for row in clock))
     while True:
-        # A lost arrival may still connect two that are not, but none from which one difference is left.
-        ends = [left for row in lost if len(left := set(row.differences) - dropped) == 1]
+        # A dropped arrival may still connect two that are kept, unless only one of its differences is left.
+        ends = [left for row in removed if len(left := set(row.differences) - dropped) == 1]
         if not ends:
             return dropped
         dropped.update(*ends)
@@ -141,8 +141,8 @@ def clocks_of_differences(differences: Sequence[Difference]) -> list[list[Arriva
 
     The arrivals are the differences' least squares; their variances such that those of two stations add up to the
     variance of the difference between them, half of the smallest falling to either side. Where a loop of differences
-    says more than once how far two arrivals are apart, only the least noisy ones that connect all stations say how
-    noisy the arrivals are: what else is said of the same arrivals is no news.
+    measures the distance of two arrivals more than once, only the least noisy differences that connect all stations
+    determine the variances: further ones of the same arrivals are not independent.
 
     Raises
     ------
@@ -207,10 +207,10 @@ def _variances(tree: Sequence[Difference]) -> dict[str, float]:
 
 def _least_squares(names: Sequence[str], differences: Sequence[Difference]) -> dict[str, float]:
     """Arrivals, m, whose differences are nearest to those measured; that at the first station is zero."""
-    place = {name: n for n, name in enumerate(names)}
+    index = {name: n for n, name in enumerate(names)}
     rows = np.zeros((len(differences), len(names)))
     for n, d in enumerate(differences):
-        rows[n, place[d.station_id]], rows[n, place[d.reference_id]] = 1.0, -1.0
+        rows[n, index[d.station_id]], rows[n, index[d.reference_id]] = 1.0, -1.0
     value = np.array([d.value for d in differences])
     stdev = np.sqrt([d.variance for d in differences])
     arrivals = np.zeros(len(names))
@@ -218,7 +218,7 @@ def _least_squares(names: Sequence[str], differences: Sequence[Difference]) -> d
     arrivals[1:] = solution
     apart = np.abs(value - rows @ arrivals)
     allowed = _CONTRADICTION * stdev * [d.error_model.tail_scale for d in differences]
-    # What rounding makes of large numbers is no contradiction.
+    # The rounding error of large numbers is no contradiction.
     worst = int(np.argmax(apart - allowed - 1e-9 * np.abs(value)))
     if apart[worst] > allowed[worst] + 1e-9 * abs(value[worst]):
         d = differences[worst]
@@ -233,9 +233,9 @@ def _least_squares(names: Sequence[str], differences: Sequence[Difference]) -> d
 
 
 def _near_each_other(clock: Sequence[Arrival], max_path_length: float) -> list[Arrival]:
-    """Count times of arrival from their middle and leave out those farther from it than paths can make them.
+    """Subtract the weighted median from times of arrival, and leave out those farther from it than paths can be long.
 
-    Counted so, the clock's offset is a mere path length whatever the clock shows, and squares keep their precision.
+    The clock's offset is then no longer than a path, whatever the clock shows, and squares keep their precision.
     """
     if not clock:
         return []

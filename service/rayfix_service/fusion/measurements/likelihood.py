@@ -9,14 +9,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from rayfix_service.fusion.measurements.report import ErrorModel
-
-_LOG_2PI = math.log(2.0 * math.pi)
+from rayfix_tables.gaussians.constants import LOG_2PI
 
 _NARROW = 0.25
 """Standard deviation of a logarithm up to which the log-normal is cut no finer than in two: an error of 25 %."""
 
 _GAUSSIAN_BELOW = 0.05
-"""Standard deviation of a logarithm below which one Gaussian will do."""
+"""Standard deviation of a logarithm below which one Gaussian is enough."""
 
 _STEP = 1.5
 """From one narrow Gaussian to the next, in their standard deviations: their sum ripples by less than a thousandth."""
@@ -26,7 +25,7 @@ _REACH = 2.6
 
 
 class Spread(NamedTuple):
-    """One of the Gaussians that an error may be of, and by how much it is wider than the measurement says."""
+    """One of the Gaussians that an error may be of; ``scale`` is in standard deviations of the measurement."""
 
     log_weight: float
     scale: float
@@ -61,9 +60,9 @@ def gaussian_terms(value: float, stdev: float, model: ErrorModel) -> tuple[Term,
 def log_normal_terms(value: float, log_stdev: float) -> tuple[Term, ...]:
     """Likelihood of a path length [m] with a relative error, per metre: ``N(log value; log L, log_stdev^2) / value``.
 
-    The Gaussian in log L is cut into narrow ones (a Gaussian is a sum of evenly spaced narrower ones to a high degree),
-    each of which is a log-normal in L so narrow that the Gaussian with its moments will do: 9 for a deviation of up to
-    0.5, wrong by at most 5 % of the peak.
+    The Gaussian in log L is cut into narrow ones (a Gaussian is very nearly a sum of equally spaced narrower ones),
+    each of which is a log-normal in L so narrow that the Gaussian with its moments is close enough: 9 for a standard
+    deviation of up to 0.5, with an error of at most 5 % of the peak.
     """
     if log_stdev < _GAUSSIAN_BELOW:
         narrow, rest, count = log_stdev, 1.0, 0
@@ -72,13 +71,13 @@ def log_normal_terms(value: float, log_stdev: float) -> tuple[Term, ...]:
         rest = math.sqrt(log_stdev**2 - narrow**2)
         count = math.ceil(_REACH * rest / (_STEP * narrow))
     step = _STEP * narrow
-    places = [step * k for k in range(-count, count + 1)]
-    weights = [math.exp(-0.5 * (place / rest) ** 2) for place in places]
+    offsets = [step * k for k in range(-count, count + 1)]
+    weights = [math.exp(-0.5 * (offset / rest) ** 2) for offset in offsets]
     # As a function of L this is a log-normal density with the median value exp(log_stdev^2), times this constant.
     log_total = 0.5 * log_stdev**2 - math.log(sum(weights))
     terms = []
-    for place, weight in zip(places, weights, strict=True):
-        mean = value * math.exp(log_stdev**2 + place + 0.5 * narrow**2)
+    for offset, weight in zip(offsets, weights, strict=True):
+        mean = value * math.exp(log_stdev**2 + offset + 0.5 * narrow**2)
         terms.append(Term(math.log(weight) + log_total, mean, math.expm1(narrow**2) * mean**2))
     return tuple(terms)
 
@@ -105,8 +104,8 @@ def product(terms: Sequence[Term], shared_variance: float) -> Term:
         return Term(terms[0].log_weight, terms[0].value, terms[0].variance + shared_variance)
     precision = sum(1.0 / term.variance for term in terms)
     value = sum(term.value / term.variance for term in terms) / precision
-    log_weight = 0.5 * (_LOG_2PI - math.log(precision))
+    log_weight = 0.5 * (LOG_2PI - math.log(precision))
     for term in terms:
         square = (term.value - value) ** 2 / term.variance
-        log_weight += term.log_weight - 0.5 * (square + math.log(term.variance) + _LOG_2PI)
+        log_weight += term.log_weight - 0.5 * (square + math.log(term.variance) + LOG_2PI)
     return Term(log_weight, value, 1.0 / precision + shared_variance)

@@ -45,7 +45,7 @@ MOST_COMBINATIONS = 256
 
 
 class Observation(NamedTuple):
-    """All that a report says of one path to one station.
+    """All measurements of one path to one station.
 
     Attributes
     ----------
@@ -57,13 +57,13 @@ class Observation(NamedTuple):
         Of the part of their errors that the lengths have in common.
     readings : tuple of ClockReading
     angle_index : int or None
-        Place of the angle in the report.
+        Index of the angle in the report.
     timing_indices : tuple of int
-        Places of the other measurements in the report.
+        Indices of the other measurements in the report.
     differences : tuple of int
-        Places of the time differences to which the path's arrival belongs; each belongs to two.
+        Indices of the time differences to which the path's arrival belongs; each belongs to two.
     los_probability : float or None
-        That the path is direct, in the receiver's judgement.
+        Probability that the path is direct, as the receiver indicates it.
     """
 
     station_id: str
@@ -79,7 +79,7 @@ class Observation(NamedTuple):
 
 
 class SortedReport(NamedTuple):
-    """Observations, the number of unknown clocks, and what could not be used, with the reason, by place."""
+    """Observations, the number of unknown clocks, and why measurements could not be used, by their indices."""
 
     observations: tuple[Observation, ...]
     num_clocks: int
@@ -87,16 +87,16 @@ class SortedReport(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """A direction and its place in the report."""
+    """A direction and its index in the report."""
 
-    place: int
+    angle_index: int
     direction: Direction
     spreads: tuple[Spread, ...]
 
 
 @dataclass
 class _Draft:
-    """A station's observations in the making; a direction that cannot be used is None, and keeps its place."""
+    """A station's observations in the making; a direction that cannot be used is None, which keeps the order."""
 
     station: Station
     directions: list[_Seen | None] = field(default_factory=list)
@@ -137,7 +137,7 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
             case Range(path_length=length, error_model=model):
                 draft.lengths.append((index, gaussian_terms(length - bias.range, measurement.stdev, model)))
             case LogRange():
-                # A signal strength has no clock that could be late, so no bias of the range.
+                # A signal strength involves no clock, so that the bias of ranges does not apply.
                 draft.lengths.append((index, log_normal_terms(measurement.path_length, measurement.log_stdev)))
             case TimeOfArrival(path_length=offset, error_model=model):
                 arrivals.append(
@@ -181,9 +181,9 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
 
 
 def _with_line_of_sight(observation: Observation, report: Report) -> Observation:
-    places = (observation.angle_index, *observation.timing_indices)
-    said = los_probability(report.measurements[place] for place in places if place is not None)
-    return observation._replace(los_probability=said)
+    indices = (observation.angle_index, *observation.timing_indices)
+    indicated = los_probability(report.measurements[index] for index in indices if index is not None)
+    return observation._replace(los_probability=indicated)
 
 
 def _unbiased(arrival: Arrival, station: Station) -> Arrival:
@@ -194,10 +194,10 @@ def _unbiased(arrival: Arrival, station: Station) -> Arrival:
 
 
 def _refuse_repetitions(report: Report) -> None:
-    """Refuse a measurement that is sent twice: counted twice it would make the fix too sure of itself.
+    """Refuse a measurement that is sent twice: counted twice it would make the fix overconfident.
 
     Two paths of a station may well be of one length, so a length may be repeated once for each of its angles. Time
-    differences may be repeated: they say the same of the same arrivals.
+    differences may be repeated: they are of the same arrivals.
     """
     kinds = {(type(measurement), measurement.station_id) for measurement in report.measurements}
     if len(kinds) == len(report.measurements) or len(set(report.measurements)) == len(report.measurements):
@@ -205,15 +205,15 @@ def _refuse_repetitions(report: Report) -> None:
     paths: defaultdict[str, int] = defaultdict(int)
     for measurement in report.measurements:
         paths[measurement.station_id] += isinstance(measurement, Angle)
-    places: defaultdict[Measurement, list[int]] = defaultdict(list)
+    indices_of: defaultdict[Measurement, list[int]] = defaultdict(list)
     for index, measurement in enumerate(report.measurements):
         if not isinstance(measurement, TimeDifference):
-            places[measurement].append(index)
-    for measurement, indices in places.items():
+            indices_of[measurement].append(index)
+    for measurement, indices in indices_of.items():
         allowed = paths[measurement.station_id] if isinstance(measurement, Range | LogRange) else 1
         if len(indices) > max(allowed, 1):
             raise ReportError(
-                f"measurements[{indices[-1]}] says the same as measurements[{indices[0]}]; send each measurement once",
+                f"measurements[{indices[-1]}] repeats measurements[{indices[0]}]; send each measurement once",
                 path=("measurements", indices[-1]),
             )
 
@@ -236,7 +236,7 @@ def _observations(draft: _Draft) -> list[Observation]:
             lengths=tuple([terms for _, terms in lengths]),
             length_bias_variance=draft.station.bias.range_stdev**2,
             readings=tuple([reading for _, reading in readings]),
-            angle_index=angle.place if angle else None,
+            angle_index=angle.angle_index if angle else None,
             timing_indices=tuple(timing_indices),
             differences=tuple([index for arrival, _ in readings for index in arrival.differences]),
         )

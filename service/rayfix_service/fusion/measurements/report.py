@@ -1,13 +1,13 @@
 """What goes into a fix, in SI units and radians.
 
-The JSON of the HTTP interface is another matter: :mod:`rayfix_service.wire` reads it into these.
+The JSON of the HTTP interface is read into these by :mod:`rayfix_service.wire`.
 """
 
 from dataclasses import dataclass, field
 from typing import Literal
 
 CONFIDENCE = 0.68
-"""Probability with which accuracies hold where a report does not say it."""
+"""Probability with which accuracies hold where a report gives none."""
 
 Frame = Literal["scene", "lcs", "north"]
 """Frame of an angle: the scene's, the station's local one, or the scene's turned to geographic north."""
@@ -142,7 +142,7 @@ class Report:
     Attributes
     ----------
     confidence : float
-        Probability with which the accuracies that other systems are told are to hold, between 0 and 1.
+        Probability, between 0 and 1, with which the accuracies in other systems' formats hold.
     """
 
     measurements: tuple[Measurement, ...]

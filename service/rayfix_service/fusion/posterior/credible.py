@@ -1,7 +1,7 @@
 """Credible regions: ellipsoids, circles and layers around a position that hold the UE with a stated probability.
 
-The posterior has several modes and is cut to the free space, so no covariance tells how far a region must reach. Points
-drawn evenly from the whole posterior do: the region of probability p is as large as it takes to hold a share p of them.
+The posterior has several modes and is cut to the free space, so no covariance determines the size of a region. Points
+drawn from the whole posterior do: the region of probability p is the smallest that holds a fraction p of them.
 Where the best candidate is less probable than p, the region reaches to its rivals.
 """
 
@@ -13,10 +13,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.posterior.cholesky import cholesky
 from rayfix_service.fusion.posterior.order_statistics import nth_smallest
 from rayfix_service.fusion.posterior.points import Points
 from rayfix_service.fusion.posterior.principal_axes import semi_axes
+from rayfix_tables.gaussians.cholesky import cholesky
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,7 @@ class Ellipsoid:
     centre : ndarray of shape (3,), m
     shape : ndarray of shape (3, 3), m2
     probability : float
-        That the UE lies in it: as asked for, but never more than the share of the regions that it is one of.
+        Probability that the UE lies in it: the requested one, but at most ``share`` of its :class:`CredibleRegions`.
     """
 
     centre: NDArray[np.float64]
@@ -58,8 +58,8 @@ class CredibleRegions:
     points : Points
         Stand for the posterior.
     share : float
-        Probability that the UE is where the points are. If all measurements are outliers it is anywhere, and no region
-        is credible beyond this share.
+        Probability that the UE is where the points are. If all measurements are outliers it is anywhere, so that no
+        region holds it with a higher probability.
     """
 
     position: NDArray[np.float64]
@@ -97,7 +97,7 @@ class CredibleRegions:
         return self.accuracies(probability).vertical_half_height
 
     def _held(self, probability: float) -> float:
-        """Share of the points that a region of a probability holds; above 1 where no region is as probable."""
+        """Fraction of the points that a region of a probability holds; above 1 where no region is as probable."""
         return probability / max(self.share, 1e-9)
 
 
@@ -115,61 +115,61 @@ class Accuracies(NamedTuple):
     ellipsoid: Ellipsoid
 
 
-def _rows(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Give the coordinates of places one after the other, shape (3, k)."""
-    return np.ascontiguousarray(places.T)
+def _rows(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Give the coordinates of positions one after the other, shape (3, k)."""
+    return np.ascontiguousarray(positions.T)
 
 
 @numba.njit(cache=True, nogil=True)
-def _accuracies(places: Any, position: Any, covariance: Any, held: Any) -> Any:
+def _accuracies(positions: Any, position: Any, covariance: Any, held: Any) -> Any:
     """Radius of the circle, half the height of the layer, and shape of the smaller ellipsoid.
 
     Parameters
     ----------
-    places : ndarray of shape (3, k), m
+    positions : ndarray of shape (3, k), m
         Of the points.
     position, covariance : ndarray
         As in :class:`CredibleRegions`.
     held : float
-        Share of the points that each of them holds.
+        Fraction of the points that each of them holds.
     """
-    apart = _apart(places, position)
-    place = _place(held, apart.shape[1])
+    apart = _apart(positions, position)
+    rank = _rank(held, apart.shape[1])
     x, y, z = apart
-    radius = math.sqrt(nth_smallest(x * x + y * y, place))
-    half_height = nth_smallest(np.abs(z), place)
-    best = _scale(_squared_distances(apart, covariance), place) * covariance
+    radius = math.sqrt(nth_smallest(x * x + y * y, rank))
+    half_height = nth_smallest(np.abs(z), rank)
+    best = _scale(_squared_distances(apart, covariance), rank) * covariance
     whole = _second_moment(apart) + 1e-9 * covariance
-    other = _scale(_squared_distances(apart, whole), place) * whole
+    other = _scale(_squared_distances(apart, whole), rank) * whole
     return radius, half_height, other if _determinant(other) < _determinant(best) else best
 
 
 @numba.njit(cache=True, nogil=True)
-def _reaching(places: Any, position: Any, shape: Any, held: Any) -> Any:
+def _reaching(positions: Any, position: Any, shape: Any, held: Any) -> Any:
     """Make an ellipsoid of some shape as large as it must be; the other arguments are those of :func:`_accuracies`."""
-    apart = _apart(places, position)
-    return _scale(_squared_distances(apart, shape), _place(held, apart.shape[1])) * shape
+    apart = _apart(positions, position)
+    return _scale(_squared_distances(apart, shape), _rank(held, apart.shape[1])) * shape
 
 
 @numba.njit(cache=True, nogil=True)
-def _apart(places: Any, position: Any) -> Any:
-    """Count places, shape (3, k), from a position."""
-    apart = np.empty_like(places)
+def _apart(positions: Any, position: Any) -> Any:
+    """Differences of positions, shape (3, k), from one position."""
+    apart = np.empty_like(positions)
     for i in range(3):
-        apart[i] = places[i] - position[i]
+        apart[i] = positions[i] - position[i]
     return apart
 
 
 @numba.njit(cache=True, nogil=True)
-def _place(held: Any, count: Any) -> Any:
-    """Place, in the order of the values of points, of the least up to which a share of them lies; else the last."""
+def _rank(held: Any, count: Any) -> Any:
+    """Rank, from 0, of the least value that is no smaller than a fraction of all; the last rank where there is none."""
     return max(math.ceil(min(1.0, held) * count), 1) - 1
 
 
 @numba.njit(cache=True, nogil=True)
-def _scale(squared_distances: Any, place: Any) -> Any:
-    """Factor that makes an ellipsoid reach to the point at a place."""
-    return max(nth_smallest(squared_distances, place), 1e-12)
+def _scale(squared_distances: Any, rank: Any) -> Any:
+    """Factor that makes an ellipsoid reach to the point of a rank."""
+    return max(nth_smallest(squared_distances, rank), 1e-12)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -183,7 +183,7 @@ def _determinant(a: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _second_moment(apart: Any) -> Any:
-    """Second moment of points about the place from which they are counted, shape (3, 3), m2."""
+    """Second moment of differences from a position, shape (3, 3), m2."""
     moment = np.zeros((3, 3))
     for n in range(apart.shape[1]):
         x, y, z = apart[0, n], apart[1, n], apart[2, n]
@@ -199,7 +199,7 @@ def _second_moment(apart: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _squared_distances(apart: Any, cov: Any) -> Any:
-    """Squares of the Mahalanobis distances of points from the place from which they are counted, shape (k,).
+    """Squares of the Mahalanobis lengths of differences from a position, shape (k,).
 
     They are infinite if the covariance is not positive definite: no ellipsoid of that shape reaches a point.
     """

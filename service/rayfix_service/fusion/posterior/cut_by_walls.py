@@ -9,8 +9,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from rayfix_service.fusion.posterior.cholesky import cholesky
 from rayfix_service.fusion.posterior.voxels import in_voxels, is_free
+from rayfix_tables.gaussians.cholesky import cholesky
 
 _LEAST_FREE_SHARE = 1e-3
 """Weight that is left of a Gaussian which lies in a solid: the scene is not exact to the voxel."""

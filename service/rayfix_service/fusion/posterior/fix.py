@@ -1,6 +1,6 @@
 """What comes out of a fix, in SI units.
 
-The JSON of the HTTP interface is another matter: :mod:`rayfix_service.wire` writes it.
+The JSON of the HTTP interface is written by :mod:`rayfix_service.wire`.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ Status = Literal["ok", "ambiguous", "inconsistent", "insufficient"]
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """One place where the UE may be.
+    """One position that the UE may have.
 
     Attributes
     ----------
@@ -39,12 +39,12 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What became of one measurement of the report.
+    """Outcome of one measurement of the report.
 
     Attributes
     ----------
     used : bool
-        False for a measurement that could not contribute; ``reason`` then says why.
+        False for a measurement that could not contribute; ``reason`` then gives the cause.
     outlier_probability : float or None
         Posterior probability that this measurement has nothing to do with the position; None when not used.
     """
@@ -73,7 +73,8 @@ class Fix:
     confidence : float
         Probability that the report wants regions of.
     simplified : tuple of str
-        What was worked out more coarsely than the report says, since the work per report is bounded; mostly empty.
+        What was worked out more coarsely than the report says, since the work per report is bounded or because
+        rounding made covariances singular; mostly empty.
     """
 
     status: Status

@@ -1,4 +1,4 @@
-"""Sum the hypotheses of a report up in a fix."""
+"""Summarise the hypotheses of a report in a fix."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.table import Table
 
 _LEAST_CANDIDATE = 1e-3
-"""Candidates less probable than this are not told."""
+"""Candidates less probable than this are left out of the fix."""
 
 
 class Product(NamedTuple):
@@ -28,11 +28,12 @@ class Product(NamedTuple):
     observations : list of Observation
         Those that contribute.
     unused : dict of int to str
-        Why measurements do not, by their places in the report.
+        Why measurements do not, by their indices in the report.
     prior : Prior
     hypotheses : Hypotheses or None
     simplified : tuple of str
-        What was worked out more coarsely than the report says, since the work per report is bounded.
+        What was worked out more coarsely than the report says, since the work per report is bounded or because
+        rounding made covariances singular.
     """
 
     observations: list[Observation]
@@ -43,7 +44,7 @@ class Product(NamedTuple):
 
 
 def make_fix(report: Report, product: Product, table: Table, settings: FusionSettings, stop: Stop = NEVER) -> Fix:
-    """Sum the hypotheses of a report up.
+    """Summarise the hypotheses of a report.
 
     Parameters
     ----------
@@ -68,11 +69,13 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
     hypotheses = product.hypotheses
     if hypotheses is not None:
         found = outlier_index(product.observations)
-        if not len(hypotheses):
+        summary = None
+        if len(hypotheses):
+            summary = sum_up(hypotheses, found, table.scene.free_space, settings.hypothesis_floor, stop)
+        if summary is None or not len(summary.probability):
             log_evidence, status = hypotheses.log_all_outlier, "inconsistent"
             outlier = dict.fromkeys(found.places, 1.0)
         else:
-            summary = sum_up(hypotheses, found, table.scene.free_space, settings.hypothesis_floor, stop)
             log_evidence, share = summary.log_evidence, 1.0 - summary.lost
             candidates = tuple(
                 Candidate(probability=p * share, position=summary.position[n], covariance=summary.moment[n])

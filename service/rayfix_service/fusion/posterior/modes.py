@@ -1,18 +1,39 @@
-"""From a mixture of hypotheses to candidates: the modes of the posterior, and which hypotheses belong to which.
+"""The candidates of a mixture of hypotheses: modes of the posterior, and the hypotheses that belong to each.
 
 The NumPy twins of some kernels are in ``reference.py``.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from rayfix_service.fusion.posterior.cholesky import cholesky, invert, solve
-from rayfix_service.fusion.posterior.voxels import is_free_place, nearest_free
+from rayfix_service.fusion.posterior.voxels import is_free_position, nearest_free
+from rayfix_tables.gaussians.cholesky import cholesky, invert, solve
 
 _SAME_MODE = 9.0
 """Two maxima nearer than this, squared and in what either is uncertain by, count as one mode."""
+
+
+class _Gaussians(NamedTuple):
+    """Gaussians with positive definite covariances.
+
+    Attributes
+    ----------
+    log_density : ndarray of shape (h,)
+        Log weight plus half the log determinant of the precision.
+    weight : ndarray of shape (h,)
+    mean : ndarray of shape (h, 3), m
+    cov : ndarray of shape (h, 3, 3), m2
+    precision : ndarray of shape (h, 3, 3), 1 / m2
+    """
+
+    log_density: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    cov: NDArray[np.float64]
+    precision: NDArray[np.float64]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -36,7 +57,7 @@ def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
     probability : ndarray of shape (m,)
         Of each mode, the most probable first.
     position : ndarray of shape (m, 3), m
-        Mean of the mode's Gaussians; the mode itself, or the nearest free place, where the mean is in a solid.
+        Mean of the mode's Gaussians; the mode itself, or the nearest free position, where the mean is in a solid.
     moment : ndarray of shape (m, 3, 3), m2
         Second moment of the mode's Gaussians about ``position``.
     member : ndarray of int64, shape (h,)
@@ -51,36 +72,14 @@ def find_modes(log_weight: Any, mean: Any, cov: Any, origin: Any, voxel_size: An
             invert(lower, precision[h])
             log_density[h] = log_weight[h] - np.log(lower[0, 0] * lower[1, 1] * lower[2, 2])
     which = np.flatnonzero(definite)
-    return _modes(
-        log_density[which],
-        np.exp(log_weight[which]),
-        mean[which],
-        cov[which],
-        precision[which],
-        which,
-        len(log_weight),
-        origin,
-        voxel_size,
-        free,
-        stop,
-    )
+    definite_ones = _Gaussians(log_density[which], np.exp(log_weight[which]), mean[which], cov[which], precision[which])
+    return _modes(definite_ones, which, len(log_weight), origin, voxel_size, free, stop)
 
 
 @numba.njit(cache=True, nogil=True)
-def _modes(
-    log_density: Any,
-    weight: Any,
-    mean: Any,
-    cov: Any,
-    precision: Any,
-    which: Any,
-    total: Any,
-    origin: Any,
-    voxel_size: Any,
-    free: Any,
-    stop: Any,
-) -> Any:
+def _modes(gaussians: Any, which: Any, total: Any, origin: Any, voxel_size: Any, free: Any, stop: Any) -> Any:
     """Find the modes of Gaussians that are ``which`` of a ``total``; those left out count as the first mode's."""
+    log_density, weight, mean, cov, precision = gaussians
     count = len(weight)
     top, member = gather(log_density, mean, precision, _SAME_MODE, stop)
     probability, position = np.zeros(len(top)), np.zeros((len(top), 3))
@@ -90,12 +89,12 @@ def _modes(
             position[member[h], i] += weight[h] * mean[h, i]
     for n in range(len(top)):
         position[n] /= probability[n]
-        if not is_free_place(free, origin, voxel_size, position[n]):
+        if not is_free_position(free, origin, voxel_size, position[n]):
             position[n] = top[n]
     moment = _second_moments(weight, mean, cov, member, probability, position)
     moved = False
     for n in range(len(top)):
-        if not is_free_place(free, origin, voxel_size, position[n]):
+        if not is_free_position(free, origin, voxel_size, position[n]):
             moved |= nearest_free(position[n], moment[n], origin, voxel_size, free)
     if moved:
         moment = _second_moments(weight, mean, cov, member, probability, position)
@@ -208,7 +207,7 @@ def climb(log_density: Any, mean: Any, precision: Any, start: Any, top: Any, cur
     lower = np.empty((3, 3))
     for _ in range(500):
         for n in range(len(top)):
-            # A hundredth: within a tenth of its deviation nothing but the mode itself attracts.
+            # A hundredth: within a tenth of its standard deviation only the mode itself attracts.
             if _square(x, top[n], curvature[n]) < 0.01:
                 return x, matrix, n
         highest = -np.inf

@@ -7,32 +7,32 @@ import numpy as np
 
 
 @numba.njit(cache=True, nogil=True)
-def nth_smallest(values: Any, place: Any) -> Any:
-    """Value that stands at a place, counted from 0, once values are in their order.
+def nth_smallest(values: Any, rank: Any) -> Any:
+    """Value of a rank, counted from 0.
 
-    An interval around it is halved until it holds no other value. To count what is below its middle takes no branches
-    and one instruction for several values; partitioning, whose comparisons no processor foresees, takes eight times as
-    long for a thousand values.
+    An interval around it is halved until it holds no other value. Counting the values below its middle needs no
+    branches and handles several values with one instruction; partitioning, whose branches no processor predicts, takes
+    eight times as long for a thousand values.
 
     Parameters
     ----------
     values : ndarray of shape (n,)
         Finite.
-    place : int
+    rank : int
         From 0 to n - 1.
     """
     low, high = values.min(), values.max()
-    if _count_up_to(values, low) > place:
+    if _count_up_to(values, low) > rank:
         return low
-    # No more than `place` values are up to low, more than that up to high.
+    # No more than `rank` values are up to low, more than that up to high.
     while True:
         middle = 0.5 * low + 0.5 * high
         if not low < middle < high:
             return high
         count = _count_up_to(values, middle)
-        if count == place + 1:
+        if count == rank + 1:
             return _largest_up_to(values, middle)
-        if count > place:
+        if count > rank:
             high = middle
         else:
             low = middle

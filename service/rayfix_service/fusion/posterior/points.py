@@ -1,7 +1,7 @@
 """Points that stand for a posterior.
 
-The thousand of a fix are 25 kB, and most fixes are never asked for them: kept are the ten or so Gaussians that they are
-drawn from and, of each point of a fixed standard normal, to which Gaussian it belongs.
+The thousand of a fix are 25 kB, and most fixes never need them. A fix keeps the ten or so Gaussians that they are drawn
+from and, for each point of a fixed standard normal, the Gaussian that it belongs to.
 """
 
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.posterior.cholesky import cholesky, log_sum
 from rayfix_service.fusion.posterior.voxels import in_voxels, is_free
+from rayfix_tables.gaussians.cholesky import cholesky, log_sum
 from rayfix_tables.gaussians.normal_points import normal_points
 
 IN_SOLID = -1
@@ -28,7 +28,7 @@ class Points(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ListedPoints:
-    """Points told one by one.
+    """Points listed one by one.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ def _places(mean: Any, root: Any, owner: Any, normal: Any) -> Any:
 def draw_points(log_weight: Any, mean: Any, cov: Any, normal: Any, origin: Any, voxel_size: Any, free: Any) -> Any:
     """Draw points from a mixture of Gaussians cut to the free space.
 
-    Each Gaussian gets a share of the points as its weight is (systematic resampling); those in solids are left out,
+    Each Gaussian gets points in proportion to its weight (systematic resampling); those in solids are left out,
     unless all of them are: then they all are of the first Gaussian.
 
     Parameters
@@ -95,7 +95,7 @@ def draw_points(log_weight: Any, mean: Any, cov: Any, normal: Any, origin: Any, 
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
     normal : ndarray of shape (n, 3)
-        Fill a standard normal evenly, and so does any run of them.
+        Cover a standard normal uniformly, and so does any run of them.
     origin, voxel_size, free
         As in :class:`~rayfix_tables.freespace.FreeSpace`.
 

@@ -2,7 +2,7 @@
 
 Where a fix sums the posterior up in candidates, this is the mixture of all hypotheses itself, cut to the free space:
 zero outside of it, and there the sum of the hypotheses' Gaussians and, for the case that all measurements are outliers,
-the prior. Nothing is approximated but the share of each Gaussian that is free, which points stand for.
+the prior. Only the free fraction of each Gaussian is approximated, by points.
 """
 
 from collections.abc import Iterator
@@ -15,11 +15,12 @@ from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.gaussians.constants import LOG_2PI
 from rayfix_tables.gaussians.definite import cholesky_factors
 from rayfix_tables.gaussians.normal_points import normal_points
 
 _NUM_POINTS = 4096
-"""Points that stand for a Gaussian: a share is then known to half a per cent or better, and the sum of many to less."""
+"""Points that stand for a Gaussian: its free fraction is then known to half a per cent, a sum of many better."""
 
 _CHUNK = 2**20
 """Numbers that are handled at a time."""
@@ -37,12 +38,12 @@ class Posterior:
     Attributes
     ----------
     log_weight : ndarray of shape (h,)
-        Of the Gaussians; with their free shares, and ``prior_share``, the weights sum to 1.
+        Of the Gaussians; weighted with their free fractions and added to ``prior_share``, they sum to 1.
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
         Of the Gaussians before they are cut to the free space.
     prior_share : float
-        Probability that the report says nothing of the position, because all of it is outliers or nothing can be used.
+        Probability that the report does not constrain the position: all of it is outliers, or nothing can be used.
     prior : Prior
     free_space : FreeSpace
     log_evidence : float
@@ -74,7 +75,7 @@ class Posterior:
         free = np.flatnonzero(self.free_space.contains(places))
         roots = np.linalg.inv(np.linalg.cholesky(self.cov))
         log_scale = self.log_weight + np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
-        log_scale -= 1.5 * np.log(2.0 * np.pi)
+        log_scale -= 1.5 * LOG_2PI
         step = max(1, _CHUNK // (3 * max(len(self.mean), 1)))
         for begin in range(0, len(free), step):
             chunk = free[begin : begin + step]
@@ -108,10 +109,10 @@ class Posterior:
         return np.asarray(rng.permutation(np.concatenate(parts)))
 
     def _sample_gaussians(self, count: int, rng: np.random.Generator, stop: Stop) -> Iterator[Array]:
-        """Draw from the Gaussians and keep what is free, which is exact whatever their free shares are."""
+        """Draw from the Gaussians and keep what is free, which is exact whatever their free fractions are."""
         if count == 0:
             return
-        # Shares add up to 1 - prior_share: this one is of the draws that will be free.
+        # The free fractions add up to 1 - prior_share; this is the fraction of draws that will be free.
         weight = np.exp(self.log_weight)
         free_share = (1.0 - self.prior_share) / float(weight.sum())
         weight /= weight.sum()
@@ -126,7 +127,7 @@ class Posterior:
             yield kept
 
     def _sample_prior(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw voxels, and places in them; heights from the known one's Gaussian."""
+        """Draw voxels and positions in them, and heights from the Gaussian of a known height."""
         space = self.free_space
         if self.prior.precision == 0.0:
             voxels = np.argwhere(space.free)[rng.integers(np.count_nonzero(space.free), size=count)]
@@ -188,13 +189,13 @@ def make_posterior(hypotheses: Hypotheses | None, prior: Prior, free_space: Free
 
 
 def free_shares(mean: Array, cov: Array, free_space: FreeSpace, stop: Stop = NEVER) -> Array:
-    """Share of each Gaussian that lies in the free space, shape (h,).
+    """Fraction of each Gaussian that lies in the free space, shape (h,).
 
     Parameters
     ----------
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
-        A Gaussian whose covariance is not positive definite has no share.
+        The fraction is 0 for a Gaussian whose covariance is not positive definite.
     stop : Stop
         Ends it early.
 

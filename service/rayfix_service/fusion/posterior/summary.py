@@ -1,4 +1,4 @@
-"""Sum the hypotheses of a report up, in one compiled kernel: there are few of them, but much is asked of each."""
+"""Summarise the hypotheses of a report, in one compiled kernel: there are few of them, but many steps for each."""
 
 import math
 from typing import Any, NamedTuple
@@ -7,7 +7,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.posterior.cholesky import log_sum
 from rayfix_service.fusion.posterior.cut_by_walls import cut_to_free_space
 from rayfix_service.fusion.posterior.modes import find_modes
 from rayfix_service.fusion.posterior.points import DrawnPoints, draw_points
@@ -15,6 +14,7 @@ from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.outliers import OutlierIndex, outlier_probabilities
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.gaussians.cholesky import log_sum
 from rayfix_tables.gaussians.normal_points import normal_points, unit_points
 
 _NUM_POINTS = 1024
@@ -22,7 +22,7 @@ _NUM_POINTS = 1024
 
 
 class Summary(NamedTuple):
-    """What the hypotheses of a report come to.
+    """Summary of the hypotheses of a report.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Summary(NamedTuple):
     moment : ndarray of shape (m, 3, 3), m2
         Second moment of each mode about its position.
     outlier : ndarray of shape (count,)
-        Posterior probability of each of the culprits' measurements to be an outlier.
+        Posterior probability of each measurement of the index to be an outlier.
     half_bad : float
         Posterior probability that at least half of the observations are outliers altogether.
     points : DrawnPoints
@@ -55,14 +55,15 @@ class Summary(NamedTuple):
 def sum_up(
     hypotheses: Hypotheses, outlier_index: OutlierIndex, free_space: FreeSpace, floor: float, stop: Stop = NEVER
 ) -> Summary:
-    """Sum hypotheses up, cut to the free space.
+    """Summarise hypotheses, cut to the free space.
 
     Parameters
     ----------
     hypotheses : Hypotheses
-        At least one.
+        At least one. One whose covariance is not positive definite has no weight; where no other is, there are no
+        modes and everything is outliers.
     floor : float
-        Hypotheses whose share of the posterior is below this are left out of the modes.
+        Hypotheses whose posterior probability is below this are left out of the modes.
     stop : Stop
         Ends it early.
 
@@ -72,19 +73,13 @@ def sum_up(
         When it was.
     """
     log_evidence, lost, modes, outlier, half_bad, drawn = _sum_up(
-        hypotheses.log_weight,
-        hypotheses.mean,
-        hypotheses.cov,
+        (hypotheses.log_weight, hypotheses.mean, hypotheses.cov),
         hypotheses.outlier,
         hypotheses.log_all_outlier,
-        outlier_index.rows,
-        len(outlier_index.places),
+        (outlier_index.rows, len(outlier_index.places)),
         math.log(floor),
-        unit_points(),
-        normal_points(_NUM_POINTS),
-        free_space.origin,
-        free_space.voxel_size,
-        free_space.free,
+        (unit_points(), normal_points(_NUM_POINTS)),
+        (free_space.origin, free_space.voxel_size, free_space.free),
         stop.cell,
     )
     stop.check()
@@ -96,27 +91,44 @@ def sum_up(
 
 @numba.njit(cache=True, nogil=True)
 def _sum_up(
-    log_weight: Any,
-    mean: Any,
-    cov: Any,
+    gaussians: Any,
     outlier: Any,
     log_all_outlier: Any,
-    rows: Any,
-    count: Any,
+    index: Any,
     log_floor: Any,
-    unit: Any,
-    normal: Any,
-    origin: Any,
-    voxel_size: Any,
-    free: Any,
+    points: Any,
+    space: Any,
     stop: Any,
 ) -> Any:
-    """Give the entries of a :class:`Summary`; ``unit`` and ``normal`` are points that stand for a standard normal."""
+    """Give the entries of a :class:`Summary`.
+
+    Parameters
+    ----------
+    gaussians : tuple
+        ``log_weight``, ``mean`` and ``cov`` of the hypotheses. Plain tuples, since it takes numba 4 us to find out what
+        a named one is.
+    outlier : ndarray of int8, shape (h, n)
+    log_all_outlier : float
+    index : tuple
+        ``rows`` of an :class:`OutlierIndex`, and the number of its measurements.
+    log_floor : float
+        Logarithm of the probability below which a hypothesis is left out of the modes.
+    points : tuple of 2 ndarrays
+        Points that stand for a standard normal: few for the cut, more for regions.
+    space : tuple
+        ``origin``, ``voxel_size`` and ``free`` of the free space.
+    stop : ndarray of uint8, shape (1,)
+    """
+    log_weight, mean, cov = gaussians
+    rows, count = index
+    unit, normal = points
+    origin, voxel_size, free = space
     log_cut, cut_mean, cut_cov = cut_to_free_space(log_weight, mean, cov, unit, origin, voxel_size, free)
     log_found = log_sum(log_cut)
     log_evidence = np.logaddexp(log_found, log_all_outlier)
     lost = np.exp(log_all_outlier - log_evidence)
-    log_cut -= log_found
+    if log_found > -np.inf:
+        log_cut -= log_found
     keep = np.flatnonzero(log_cut > log_floor)
     kept = log_cut[keep], cut_mean[keep], cut_cov[keep]
     probability, position, moment, _ = find_modes(*kept, origin, voxel_size, free, stop)

@@ -5,7 +5,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from rayfix_service.fusion.posterior.cholesky import cholesky, invert
+from rayfix_tables.gaussians.cholesky import cholesky, invert
 
 _BLOCK = 8
 """Voxels along each side of a block that is searched at a time."""
@@ -13,7 +13,7 @@ _BLOCK = 8
 
 @numba.njit(cache=True, nogil=True)
 def is_free(free: Any, x: Any, y: Any, z: Any) -> Any:
-    """Whether a place lies in a free voxel; its coordinates are counted in voxels from the map's low corner.
+    """Whether a position lies in a free voxel; its coordinates are in voxels from the map's low corner.
 
     The compiled twin of :meth:`rayfix_tables.freespace.FreeSpace.contains`.
     """
@@ -41,9 +41,9 @@ def in_voxels(mean: Any, lower: Any, origin: Any, voxel_size: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def is_free_place(free: Any, origin: Any, voxel_size: Any, place: Any) -> Any:
-    """Whether a place of shape (3,), m, lies in a free voxel."""
-    x, y, z = place[0] - origin[0], place[1] - origin[1], place[2] - origin[2]
+def is_free_position(free: Any, origin: Any, voxel_size: Any, position: Any) -> Any:
+    """Whether a position of shape (3,), m, lies in a free voxel."""
+    x, y, z = position[0] - origin[0], position[1] - origin[1], position[2] - origin[2]
     return is_free(free, x / voxel_size, y / voxel_size, z / voxel_size)
 
 
@@ -51,14 +51,15 @@ def is_free_place(free: Any, origin: Any, voxel_size: Any, place: Any) -> Any:
 def nearest_free(position: Any, cov: Any, origin: Any, voxel_size: Any, free: Any) -> Any:
     """Move a position, in place, to the nearest one in the free space; False when there is no free space.
 
-    Blocks of voxels are looked at from the nearest on, until none that is left can hold a nearer place: a place so many
-    metres away is at least as many times the largest deviation away, which is no more than the root of the trace.
+    Blocks of voxels are searched from the nearest on, until none that is left can hold a nearer position. The
+    Mahalanobis distance is at least the Euclidean one divided by the largest standard deviation, which is at most the
+    root of the trace.
 
     Parameters
     ----------
     position : ndarray of shape (3,), m
     cov : ndarray of shape (3, 3), m2
-        What near means; nothing is, if it is not positive definite.
+        Of the Mahalanobis distance; there is no nearest position if it is not positive definite.
     origin, voxel_size, free
         As in :class:`~rayfix_tables.freespace.FreeSpace`.
     """

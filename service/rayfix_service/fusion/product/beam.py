@@ -1,4 +1,4 @@
-"""Multiply factors: hypotheses that pick one alternative of each, the best of them kept and the like merged."""
+"""Multiply factors: hypotheses of one alternative of each factor; the best are kept and similar ones merged."""
 
 import itertools
 import math
@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_service.fusion.product.beam_kernels import multiply_factors
+from rayfix_service.fusion.product.beam_kernels import BeamLimits, FactorArrays, multiply_factors
 from rayfix_service.fusion.product.factors import Factor
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.stopping import NEVER, Stop
 
 _MOST_PRODUCTS = 1e15
-"""More than anybody waits for: as good as infinitely many, and their number still fits an integer."""
+"""Stands for no limit: more products than can be formed in any reasonable time, and the number fits an integer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,12 +27,15 @@ class Hypotheses:
         Log evidence, the best first.
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
+        Positive definite, if :func:`multiply` made them.
     outlier : ndarray of int8, shape (h, n_factors)
         What the hypothesis takes for an outlier in each factor.
     log_all_outlier : float
         Log evidence of the hypothesis that all factors are outliers, which is none of the above.
     omitted : int
         Hypotheses that were left out because there were too many products to form.
+    dropped : int
+        Alternatives and products that were left out because rounding made their matrices singular.
     """
 
     log_weight: NDArray[np.float64]
@@ -41,6 +44,7 @@ class Hypotheses:
     outlier: NDArray[np.int8]
     log_all_outlier: float
     omitted: int = 0
+    dropped: int = 0
 
     def __len__(self) -> int:
         """Return the number of hypotheses."""
@@ -80,7 +84,7 @@ def multiply(
     prior : Prior
         Of the position.
     width : int
-        Products that are kept after each factor, before those that mean the same are merged.
+        Products that are kept after each factor, before similar ones are merged.
     max_divergence : float
         What such a merge may cost, nats.
     most_products : float
@@ -96,20 +100,20 @@ def multiply(
     columns = np.concatenate([factor.columns for factor in factors], axis=1)
     outlier = np.concatenate([factor.outlier for factor in factors])
     offsets = np.array([0, *itertools.accumulate([len(factor) for factor in factors])])
-    log_weight, mean, cov, outlier, log_all_outlier, omitted = multiply_factors(
-        columns,
-        outlier,
-        offsets,
-        prior.precision,
-        prior.eta,
-        prior.log_volume,
+    log_weight, mean, cov, outlier, log_all_outlier, omitted, dropped = multiply_factors(
+        tuple(FactorArrays(columns, outlier, offsets)),
+        tuple(prior),
         math.log(max_path_length),
-        width,
-        max_divergence,
-        float(min(most_products, _MOST_PRODUCTS)),
+        tuple(BeamLimits(width, float(max_divergence), float(min(most_products, _MOST_PRODUCTS)))),
         stop.cell,
     )
     stop.check()
     return Hypotheses(
-        log_weight=log_weight, mean=mean, cov=cov, outlier=outlier, log_all_outlier=log_all_outlier, omitted=omitted
+        log_weight=log_weight,
+        mean=mean,
+        cov=cov,
+        outlier=outlier,
+        log_all_outlier=log_all_outlier,
+        omitted=omitted,
+        dropped=dropped + sum([factor.dropped for factor in factors]),
     )

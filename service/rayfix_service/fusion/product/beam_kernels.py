@@ -4,56 +4,78 @@
 columns.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from rayfix_service.fusion.product.information_form import add, dimension_of, invert_all, log_integrals, triangle
+from rayfix_service.fusion.product.information_form import add, dimension_of, invert_all, log_integrals
 from rayfix_service.fusion.product.merging import merge_hypotheses
+from rayfix_tables.gaussians.cholesky import cholesky
+from rayfix_tables.gaussians.triangles import triangle
 
 HOPELESS = 20.0
-"""A product this many nats below the best is given up: more than one station to come would have to be an outlier."""
+"""A product this many nats below the best is dropped: two of the next stations would have to be outliers."""
+
+_LOWEST = float(np.finfo(np.float64).min)
+"""A logarithm below all others."""
 
 _RANKED_AFTER = 26
 """Factors after which numbers of outlier patterns are ranked: 3**26 times a million hypotheses is below 2**63."""
 
 
-@numba.njit(cache=True, nogil=True)
-def multiply_factors(
-    alternatives: Any,
-    outlier: Any,
-    offsets: Any,
-    precision: Any,
-    eta: Any,
-    log_volume: Any,
-    log_range: Any,
-    width: Any,
-    max_divergence: Any,
-    most_products: Any,
-    stop: Any,
-) -> Any:
-    """Extend a beam by one factor after the other, merging hypotheses that mean the same.
+class FactorArrays(NamedTuple):
+    """Alternatives of all factors, one factor after the other.
 
-    Parameters
+    Attributes
     ----------
-    alternatives : ndarray of shape (rows, k)
-        Of all factors.
+    columns : ndarray of shape (rows, k)
+        As :mod:`rayfix_service.fusion.product.information_form` has them.
     outlier : ndarray of int8, shape (k,)
         What each takes for an outlier.
     offsets : ndarray of int64, shape (n + 1,)
         Alternatives of factor f are those from ``offsets[f]`` to ``offsets[f + 1]``.
         The last of them is that all of it is an outlier.
-    precision, eta, log_volume : float
-        As in :class:`~rayfix_service.fusion.product.prior.Prior`.
-    log_range : float
-        As in :func:`~rayfix_service.fusion.product.information_form.log_integrals`.
+    """
+
+    columns: NDArray[np.float64]
+    outlier: NDArray[np.int8]
+    offsets: NDArray[np.int64]
+
+
+class BeamLimits(NamedTuple):
+    """How far a beam goes.
+
+    Attributes
+    ----------
     width : int
         Products that are kept after each factor.
     max_divergence : float
         What a merge may cost, nats.
     most_products : float
-        Products that may be formed, in those of no clock. Each factor may take its share of what is left.
+        Products that may be formed, in those of no clock. Each factor may use an equal part of what is left.
+    """
+
+    width: int
+    max_divergence: float
+    most_products: float
+
+
+@numba.njit(cache=True, nogil=True)
+def multiply_factors(factors: Any, prior: Any, log_range: Any, limits: Any, stop: Any) -> Any:
+    """Extend a beam by one factor after the other, merging similar hypotheses.
+
+    Parameters
+    ----------
+    factors : tuple
+        The fields of :class:`FactorArrays`. Plain tuples, since it takes numba 4 us to find out what a named one is.
+    prior : tuple
+        The fields of a ``Prior``.
+    log_range : float
+        As in :func:`~rayfix_service.fusion.product.information_form.log_integrals`.
+    limits : tuple
+        The fields of :class:`BeamLimits`.
     stop : ndarray of uint8, shape (1,)
         As in :class:`~rayfix_service.fusion.stopping.Stop`, looked at for each hypothesis.
 
@@ -63,38 +85,45 @@ def multiply_factors(
         Of the hypotheses that place the UE, the best first.
     mean : ndarray of shape (h, 3), m
     cov : ndarray of shape (h, 3, 3), m2
+        Positive definite.
     outlier : ndarray of int8, shape (h, n)
     log_all_outlier : float
         Log evidence of the hypothesis that all factors are outliers, which is none of the above.
     omitted : int
         Hypotheses that ``most_products`` left out.
+    dropped : int
+        Products that were left out because rounding made their matrices singular.
     """
-    beam = _prior_column(dimension_of(alternatives), precision, eta, log_volume, log_range)
+    alternatives, outlier, offsets = factors
+    width, max_divergence, most_products = limits
+    log_volume = prior[0]
+    beam = _prior_column(dimension_of(alternatives), prior, log_range)
     chosen = np.zeros((1, len(offsets) - 1), np.int8)
     pattern = np.zeros(1, np.int64)
     score = np.zeros(1)
     product_cost, merge_cost = product_costs(dimension_of(alternatives))
-    left_over, omitted = most_products, 0
+    left_over, omitted, dropped = most_products, 0, 0
     order = _order(alternatives[-1], offsets)
-    for place in range(len(order)):
+    for step in range(len(order)):
         if stop[0] != 0:
             break
-        factor = order[place]
+        factor = order[step]
         begin, end = offsets[factor], offsets[factor + 1]
         own = np.ascontiguousarray(alternatives[:, begin:end])
-        # Half of a factor's share is for the products, half for merging them.
-        share = 0.5 * left_over / (len(order) - place)
-        most = max(1, int(share / (product_cost * (end - begin))))
+        # Half of a factor's budget is for the products, half for merging them.
+        budget = 0.5 * left_over / (len(order) - step)
+        most = max(1, int(budget / (product_cost * (end - begin))))
         if most < beam.shape[1]:
             omitted += beam.shape[1] - most
             beam = np.ascontiguousarray(beam[:, :most])
-        kept = max(1, min(width, int(share / merge_cost)))
-        parent, choice, score = extend_beam(beam, own, kept, HOPELESS, log_volume, log_range, stop)
+        kept = max(1, min(width, int(budget / merge_cost)))
+        parent, choice, score, singular = extend_beam(beam, own, kept, HOPELESS, log_volume, log_range, stop)
+        dropped += singular
         if kept < width and len(score) == kept:
             omitted += 1  # at least
         left_over -= product_cost * beam.shape[1] * (end - begin) + merge_cost * len(score)
         product = np.empty((len(beam), len(score)))
-        next_pattern = extend_patterns(pattern[parent], outlier[begin + choice], place)
+        next_pattern = extend_patterns(pattern[parent], outlier[begin + choice], step)
         for row in range(len(beam)):
             for n in range(len(score)):
                 product[row, n] = beam[row, parent[n]] + own[row, choice[n]]
@@ -112,13 +141,13 @@ def multiply_factors(
     log_all_outlier = 0.0
     for factor in range(len(offsets) - 1):
         log_all_outlier += alternatives[-1, offsets[factor + 1] - 1]
-    log_weight, mean, cov, chosen = _placed(beam, score, chosen)
-    return log_weight, mean, cov, chosen, log_all_outlier, omitted
+    log_weight, mean, cov, chosen, singular = place_hypotheses(beam, score, chosen)
+    return log_weight, mean, cov, chosen, log_all_outlier, omitted, dropped + singular
 
 
 @numba.njit(cache=True, nogil=True)
-def extend_patterns(pattern: Any, outlier: Any, place: Any) -> Any:
-    """Give numbers to what hypotheses take for outliers, one factor more included; equal numbers mean equal patterns.
+def extend_patterns(pattern: Any, outlier: Any, num_before: Any) -> Any:
+    """Extend the numbers of hypotheses' outlier patterns by one factor; equal numbers mean equal patterns.
 
     A number has a digit to the base 3 for each factor. Every so many factors the numbers are replaced by their ranks,
     before they exceed 63 bits.
@@ -129,11 +158,11 @@ def extend_patterns(pattern: Any, outlier: Any, place: Any) -> Any:
         Numbers without the factor.
     outlier : ndarray of int8, shape (h,)
         What each hypothesis takes for an outlier in the factor: 0, 1 or 2.
-    place : int
+    num_before : int
         Number of factors before this one.
     """
     extended = 3 * pattern + outlier
-    if place % _RANKED_AFTER != _RANKED_AFTER - 1:
+    if num_before % _RANKED_AFTER != _RANKED_AFTER - 1:
         return extended
     ranked = np.empty_like(extended)
     rank, order = -1, np.argsort(extended)
@@ -153,9 +182,9 @@ def product_costs(dimension: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def _order(log_scale: Any, offsets: Any) -> Any:
-    """Order in which factors are taken, shape (n,): few alternatives first, which cut the beam before it meets many.
+    """Order in which factors are taken, shape (n,): those with few alternatives first, which keep the beam narrow.
 
-    Which of two alike comes first must not depend on the report's order.
+    Which of two equal ones comes first must not depend on the report's order.
     """
     total = np.empty(len(offsets) - 1)
     for factor in range(len(total)):
@@ -165,8 +194,9 @@ def _order(log_scale: Any, offsets: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _prior_column(dimension: Any, precision: Any, eta: Any, log_volume: Any, log_range: Any) -> Any:
-    """Prior of position and clocks, shape (rows, 1); a clock lies evenly in a range of that logarithm."""
+def _prior_column(dimension: Any, prior: Any, log_range: Any) -> Any:
+    """Prior of position and clocks, shape (rows, 1); a clock's offset is uniform over a range of that logarithm."""
+    log_volume, precision, eta = prior
     column = np.zeros((triangle(dimension) + dimension + 1, 1))
     column[triangle(3) - 1] = precision
     column[triangle(dimension) + 2] = eta
@@ -181,13 +211,13 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
     Parameters
     ----------
     beam : ndarray of shape (rows, h)
-        Hypotheses; the better come first for speed alone.
+        Hypotheses; the better ones come first, for speed only.
     factor : ndarray of shape (rows, k)
         Alternatives.
     width : int
         Products to keep.
     hopeless : float
-        Products this many nats below the best are given up.
+        Products this many nats below the best are dropped.
     log_volume, log_range : float
         As in :func:`~rayfix_service.fusion.product.information_form.log_integrals`.
     stop : ndarray of uint8, shape (1,)
@@ -199,6 +229,8 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
         Hypothesis and alternative of each product, in no order.
     score : ndarray of shape (n,)
         Log evidence of each product.
+    dropped : int
+        Products that were left out because rounding made their matrices singular.
     """
     count = factor.shape[1]
     products = np.empty(factor.shape)
@@ -207,13 +239,15 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
     parent, choice = np.empty(most, np.int64), np.empty(most, np.int64)
     score = np.empty(most)
     heap = np.empty(most, np.int64)
-    kept = 0
-    top = -np.inf
+    kept, dropped = 0, 0
+    top = _LOWEST  # not -inf, which a singular product has
     for h in range(beam.shape[1]):
         if stop[0] != 0:
             break
         add(beam, h, factor, products)
         log_integrals(products, log_volume, log_range, scratch, values)
+        for k in range(count):  # a loop of its own, which the compiler turns into a few instructions
+            dropped += not values[k] > -np.inf
         for k in range(count):
             value = values[k]
             if not value >= top - hopeless:
@@ -228,7 +262,7 @@ def extend_beam(beam: Any, factor: Any, width: Any, hopeless: Any, log_volume: A
                 parent[slot], choice[slot], score[slot] = h, k, value
                 _sift_down(score, heap, kept)
     hopeful = np.flatnonzero(score[:kept] >= top - hopeless)
-    return parent[hopeful], choice[hopeful], score[hopeful]
+    return parent[hopeful], choice[hopeful], score[hopeful], dropped
 
 
 @numba.njit(cache=True, nogil=True)
@@ -258,26 +292,48 @@ def _sift_down(scores: Any, heap: Any, count: Any) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _placed(beam: Any, score: Any, chosen: Any) -> Any:
-    """Means and covariances of the position, of the hypotheses that say something of it."""
+def place_hypotheses(beam: Any, score: Any, chosen: Any) -> Any:
+    """Give means and covariances of the position, of the hypotheses that constrain it.
+
+    Parameters
+    ----------
+    beam : ndarray of shape (rows, h)
+        Hypotheses, as :mod:`rayfix_service.fusion.product.information_form` has them.
+    score : ndarray of shape (h,)
+        Log evidence.
+    chosen : ndarray of int8, shape (h, n)
+        What each hypothesis takes for an outlier.
+
+    Returns
+    -------
+    score, mean, cov, chosen : ndarray
+        Of the hypotheses that place the UE; covariances are positive definite.
+    dropped : int
+        Hypotheses that were left out because rounding made their matrices singular.
+    """
     dimension = dimension_of(beam)
     first = triangle(dimension)
-    cov = beam.copy()
+    inverse = beam.copy()
     for clock in range(3, dimension):
-        pivot = cov[triangle(clock) + clock]
+        pivot = inverse[triangle(clock) + clock]
         for h in range(len(pivot)):
             if pivot[h] <= 0.0:
                 # Of a clock that nothing constrains only this entry is not zero; it changes nothing else.
                 pivot[h] = 1.0
     det = np.empty(len(score))
-    invert_all(cov, dimension, det)
-    placed = np.flatnonzero((beam[0] > 0.0) & (score > -np.inf) & (det > 0.0))
-    means, covs = np.zeros((len(placed), 3)), np.empty((len(placed), 3, 3))
-    for n in range(len(placed)):
-        h = placed[n]
+    invert_all(inverse, dimension, det)
+    placing = np.flatnonzero((beam[0] > 0.0) & (score > -np.inf))
+    means, covs = np.zeros((len(placing), 3)), np.empty((len(placing), 3, 3))
+    lower = np.empty((3, 3))
+    definite = np.zeros(len(placing), np.bool_)
+    for n in range(len(placing)):
+        h = placing[n]
         for i in range(3):
             for j in range(dimension):
-                means[n, i] += cov[triangle(max(i, j)) + min(i, j), h] * beam[first + j, h]
+                means[n, i] += inverse[triangle(max(i, j)) + min(i, j), h] * beam[first + j, h]
             for j in range(3):
-                covs[n, i, j] = cov[triangle(max(i, j)) + min(i, j), h]
-    return score[placed], means, covs, chosen[placed]
+                covs[n, i, j] = inverse[triangle(max(i, j)) + min(i, j), h]
+        definite[n] = det[h] > 0.0 and cholesky(covs[n], lower)
+    kept = np.flatnonzero(definite)
+    placed = placing[kept]
+    return score[placed], means[kept], covs[kept], chosen[placed], len(placing) - len(kept)

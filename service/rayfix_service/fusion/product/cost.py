@@ -1,10 +1,10 @@
-"""How long a fix will take, told from its report alone in some microseconds.
+"""Estimate, from a report alone and in some microseconds, how long its fix will take.
 
-What a fix takes follows from how many components of the table its measurements look up, how many combinations of errors
-each of these is taken with, and how many products there are to form. The counts below are at most what the fusion will
-meet, from figures of each station that are worked out once; the constants are fitted to measured times
-(``benchmarks/fusion/worst_reports.py``), on a core of its own. Only whether a report is quick is asked, so that wide
-bounds will do: the estimate is some times too high for most reports, and hardly ever too low.
+The time follows from how many components of the table the measurements look up, how many combinations of errors each of
+these is taken with, and how many products there are to form. The counts below are upper bounds, from figures of each
+station that are computed once; the constants are fitted to measured times
+(``benchmarks/fusion/worst_reports.py``), on an idle core. The caller only needs to know whether a report is quick, so
+that wide bounds suffice: the estimate is several times too high for most reports, and hardly ever too low.
 """
 
 import math
@@ -68,7 +68,7 @@ _FEW, _FEW_COMPONENTS, _FEW_SECONDS = 4, 128, 2e-3
 """So many measurements of narrow angles, in cells of no more components, take less than so long, s."""
 
 _MANY = 32
-"""Measurements of a report that is not looked at more closely: it is not quick."""
+"""A report of more measurements than this is not quick, without a closer estimate."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +100,7 @@ def _level_cost(level: Level) -> _LevelCost:
 
 @dataclass
 class _Paths:
-    """What a report says of one station: angles, and the combinations of errors of each length and of all readings."""
+    """Measurements of one station: angles, and the combinations of errors of each length and of all readings."""
 
     angles: list[Angle] = field(default_factory=list)
     lengths: list[int] = field(default_factory=list)
@@ -110,7 +110,7 @@ class _Paths:
 
 
 class CostEstimate:
-    """Tells how long fixes will take.
+    """Estimates how long fixes will take.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ class CostEstimate:
         return seconds + self._products(alternatives, 3 + clocks)
 
     def _narrow_angles(self, measurements: Iterable[Measurement]) -> bool:
-        """Whether there are only angles that one cell answers, and ranges beside them: so most reports are told."""
+        """Whether there are only angles that one cell answers, and ranges beside them, as in most reports."""
         angles, ranges = set[str](), set[str]()
         for m in measurements:
             if isinstance(m, Angle):

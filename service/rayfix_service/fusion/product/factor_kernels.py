@@ -1,13 +1,14 @@
 """Compiled kernels of :mod:`rayfix_service.fusion.product.factors`; their NumPy twins are in ``reference.py``."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
-from rayfix_service.fusion.product.information_form import integrate_last, invert_all, triangle
+from rayfix_service.fusion.product.information_form import integrate_last, invert_all
 from rayfix_service.fusion.product.merging import NO_NOISE, merge_gaussians
-from rayfix_tables.gaussians.conditioning import LOG_2PI
+from rayfix_tables.gaussians.constants import LOG_2PI
+from rayfix_tables.gaussians.triangles import triangle
 
 ALL_GOOD, TIME_OUTLIER, ALL_OUTLIER = 0, 1, 2
 """What an alternative takes for an outlier: nothing, the observation's times, or all of it."""
@@ -38,38 +39,11 @@ RELAXED = float(np.log(8.0))
 """Alternatives of a kind that is improbable are merged at up to this many times the divergence (its logarithm)."""
 
 
-@numba.njit(cache=True, nogil=True)
-def make_alternatives(
-    log_evidence: Any,
-    mean: Any,
-    cov: Any,
-    parts: Any,
-    readings: Any,
-    num_clocks: Any,
-    precision: Any,
-    eta: Any,
-    log_volume: Any,
-    log_outlier: Any,
-    log_floor: Any,
-    max_divergence: Any,
-    most: Any,
-    stop: Any,
-) -> Any:
-    """Make the alternatives of one observation, the last of them that all of it is an outlier.
+class AlternativeLimits(NamedTuple):
+    """Which alternatives of an observation are kept.
 
-    Parameters
+    Attributes
     ----------
-    log_evidence : ndarray of shape (k,)
-        Of Gaussians over (x, path length).
-    mean : ndarray of shape (k, 4), m
-    cov : ndarray of shape (k, 4, 4), m2
-    parts : record array of PART, shape (p,)
-    readings : record array of READING
-    num_clocks : int
-        Of the state.
-    precision, eta, log_volume : float
-        As in :class:`~rayfix_service.fusion.product.prior.Prior`, which is not part of the alternatives, but of the
-        judgement which are worth keeping.
     log_outlier : float
         Scale of the outlier.
     log_floor : float
@@ -78,6 +52,32 @@ def make_alternatives(
         What merging two may cost, nats.
     most : int
         Alternatives that are kept besides the last, those with the highest evidence.
+    """
+
+    log_outlier: float
+    log_floor: float
+    max_divergence: float
+    most: int
+
+
+@numba.njit(cache=True, nogil=True)
+def make_alternatives(
+    gaussians: Any, parts: Any, readings: Any, num_clocks: Any, prior: Any, limits: Any, stop: Any
+) -> Any:
+    """Make the alternatives of one observation, the last of them that all of it is an outlier.
+
+    Parameters
+    ----------
+    gaussians : tuple
+        The fields of a ``StationMixture``. Plain tuples, since it takes numba 4 us to find out what a named one is.
+    parts : record array of PART, shape (p,)
+    readings : record array of READING
+    num_clocks : int
+        Of the state.
+    prior : tuple
+        The fields of a ``Prior``, which is not part of the alternatives, but of the judgement which are worth keeping.
+    limits : tuple
+        The fields of :class:`AlternativeLimits`.
     stop : ndarray of uint8, shape (1,)
         As in :class:`~rayfix_service.fusion.stopping.Stop`, looked at before each part.
 
@@ -88,7 +88,12 @@ def make_alternatives(
     outlier : ndarray of int8, shape (n,)
     omitted : int
         How many more there would be than ``most``.
+    dropped : int
+        Alternatives that were left out because rounding made their covariances singular.
     """
+    _, mean, cov = gaussians
+    log_volume = prior[0]
+    limits = AlternativeLimits(*limits)
     offsets = np.zeros(len(parts) + 1, np.int64)
     for p in range(len(parts)):
         offsets[p + 1] = offsets[p] + parts[p]["stop"] - parts[p]["begin"]
@@ -96,30 +101,38 @@ def make_alternatives(
     tops = np.empty(len(parts))
     for p in range(len(parts)):
         own = slice(offsets[p], offsets[p + 1])
-        tops[p] = weigh(log_evidence, mean, cov, parts[p], precision, eta, logs[own], scores[own])
-    top = max(log_outlier + log_volume, tops.max())
+        tops[p] = weigh(gaussians, parts[p], prior, logs[own], scores[own])
+    top = max(limits.log_outlier + log_volume, tops.max())
     dimension = 3 + num_clocks
+    most = limits.most
     room = min(offsets[-1], most + np.diff(offsets).max()) + 1
     columns, outlier, value = (
         np.empty((triangle(dimension) + dimension + 1, room)),
         np.empty(room, np.int8),
         np.empty(room),
     )
-    done, omitted = 0, 0
+    done, omitted, dropped = 0, 0, 0
     for p in range(len(parts)):
         if stop[0] != 0:
             break
         part = parts[p]
-        keep = np.flatnonzero(scores[offsets[p] : offsets[p + 1]] > top + log_floor)
+        keep = np.flatnonzero(scores[offsets[p] : offsets[p + 1]] > top + limits.log_floor)
         own_log, own_mean, own_cov = logs[offsets[p] + keep], mean[part["begin"] + keep], cov[part["begin"] + keep]
         if part["length_variance"] < np.inf:
             condition_on_length(own_mean, own_cov, part["length"], part["length_variance"])
         # The divergence of all parts together is what counts, though a part may turn out to be the right one.
-        allowed = max_divergence * np.exp(min(top - tops[p], RELAXED))
+        allowed = limits.max_divergence * np.exp(min(top - tops[p], RELAXED))
         left = merge_gaussians(own_log, own_mean, own_cov, NO_NOISE, allowed)
         own_readings = readings[part["first_reading"] : part["last_reading"]]
         out = slice(done, done + len(left))
         to_columns(own_log[left], own_mean[left], own_cov[left], own_readings, dimension, columns[:, out])
+        proper = np.flatnonzero(columns[-1, out] > -np.inf)
+        if len(proper) < len(left):
+            dropped += len(left) - len(proper)
+            for row in range(len(columns)):
+                columns[row, done : done + len(proper)] = columns[row, done + proper]
+            left = left[proper]
+            out = slice(done, done + len(left))
         outlier[out] = part["outlier"]
         value[out] = own_log[left] + part["log_clocks"]
         done = out.stop
@@ -131,20 +144,18 @@ def make_alternatives(
             omitted += done - most
             done = most
     columns[:-1, done] = 0.0
-    columns[-1, done] = log_outlier
+    columns[-1, done] = limits.log_outlier
     outlier[done] = ALL_OUTLIER
-    return columns[:, : done + 1].copy(), outlier[: done + 1].copy(), omitted
+    return columns[:, : done + 1].copy(), outlier[: done + 1].copy(), omitted, dropped
 
 
 @numba.njit(cache=True, nogil=True)
-def weigh(
-    log_evidence: Any, mean: Any, cov: Any, part: Any, precision: Any, eta: Any, out_log: Any, out_score: Any
-) -> Any:
+def weigh(gaussians: Any, part: Any, prior: Any, out_log: Any, out_score: Any) -> Any:
     """Give the log evidences of a part's alternatives, and scores: these with what prior and clocks will make of them.
 
     Parameters
     ----------
-    log_evidence, mean, cov, precision, eta
+    gaussians, prior : tuple
         As in :func:`make_alternatives`.
     part : record of PART
     out_log, out_score : ndarray of shape (n,)
@@ -155,6 +166,8 @@ def weigh(
     float
         The highest score.
     """
+    log_evidence, mean, cov = gaussians
+    _, precision, eta = prior
     highest = -np.inf
     for n in range(len(out_log)):
         k = part["begin"] + n
@@ -221,8 +234,8 @@ def to_columns(log_evidence: Any, mean: Any, cov: Any, readings: Any, dimension:
     dimension : int
         Of the state.
     out : ndarray of shape (rows, n)
-        Columns as :mod:`~rayfix_service.fusion.product.information_form` has them. A Gaussian that the table's rounding
-        has made singular becomes a function without weight.
+        Columns as :mod:`~rayfix_service.fusion.product.information_form` has them. A Gaussian that rounding has made
+        singular becomes a function without weight, which the caller leaves out and counts.
     """
     count = len(log_evidence)
     size = 4 if len(readings) else 3

@@ -1,4 +1,4 @@
-"""Turn an observation into a factor: alternatives for what the measured path may be."""
+"""Turn an observation into a factor: alternatives for the path that was measured."""
 
 import itertools
 import math
@@ -14,7 +14,14 @@ from rayfix_service.fusion.measurements.likelihood import Term, product, total_v
 from rayfix_service.fusion.measurements.line_of_sight import line_of_sight_weights
 from rayfix_service.fusion.measurements.observations import Observation
 from rayfix_service.fusion.product.beam_kernels import product_costs
-from rayfix_service.fusion.product.factor_kernels import ALL_GOOD, PART, READING, TIME_OUTLIER, make_alternatives
+from rayfix_service.fusion.product.factor_kernels import (
+    ALL_GOOD,
+    PART,
+    READING,
+    TIME_OUTLIER,
+    AlternativeLimits,
+    make_alternatives,
+)
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.product.station_mixture import StationMixtures, join
 from rayfix_service.fusion.settings import FusionSettings
@@ -26,7 +33,7 @@ _ANY_LENGTH = Term(0.0, 0.0, math.inf)
 
 @dataclass(frozen=True, kw_only=True)
 class Factor:
-    """Alternatives for what one path of the report says of the state z = (x, clock offsets).
+    """Alternatives for the likelihood of the state z = (x, clock offsets) given one path of the report.
 
     Attributes
     ----------
@@ -35,15 +42,18 @@ class Factor:
     outlier : ndarray of int8, shape (k,)
         ALL_GOOD, TIME_OUTLIER or ALL_OUTLIER; the last alternative is always ALL_OUTLIER.
     considered : int
-        Alternatives that were looked at for it.
+        Alternatives that were evaluated for it.
     omitted : bool
         Whether it has fewer alternatives than it would have without a bound on them.
+    dropped : int
+        Alternatives that were left out because rounding made their covariances singular.
     """
 
     columns: NDArray[np.float64]
     outlier: NDArray[np.int8]
     considered: int = 0
     omitted: bool = False
+    dropped: int = 0
 
     def __len__(self) -> int:
         """Return the number of alternatives."""
@@ -70,7 +80,7 @@ def make_factor(
     prior : Prior
         Not part of the factor, but of the judgement which alternatives are worth keeping.
     most_considered : int, optional
-        Alternatives to look at, though at least those of one combination of errors; as many as there are by default.
+        Alternatives to evaluate, though at least those of one combination of errors; all by default.
     stop : Stop
         Ends it early.
 
@@ -79,11 +89,11 @@ def make_factor(
     FixStoppedError
         When it was.
     """
-    said = observation.los_probability
-    seen = None if said is None else line_of_sight_weights(said, settings.sight_error)
+    indicated = observation.los_probability
+    weights = None if indicated is None else line_of_sight_weights(indicated, settings.sight_error)
     mixtures, bounds = [], [0]
     for spread in observation.angle_spreads:
-        mixtures.append(station.towards(_widened(observation.direction, spread.scale), seen))
+        mixtures.append(station.towards(_widened(observation.direction, spread.scale), weights))
         bounds.append(bounds[-1] + len(mixtures[-1]))
     if bounds[-1] == 0:
         return None
@@ -108,18 +118,20 @@ def make_factor(
     most = settings.most_alternatives
     if num_clocks:
         most = int(most / math.sqrt(product_costs(3 + num_clocks)[0]))
-    columns, outlier, omitted = make_alternatives(
-        *join(mixtures),
+    columns, outlier, omitted, dropped = make_alternatives(
+        tuple(join(mixtures)),
         np.array(taken, PART),
         np.array(readings, READING),
         num_clocks,
-        prior.precision,
-        prior.eta,
-        prior.log_volume,
-        log_bad + log_any_time - _log_angle_range(observation),
-        math.log(settings.component_floor),
-        settings.max_divergence,
-        most,
+        tuple(prior),
+        tuple(
+            AlternativeLimits(
+                log_outlier=log_bad + log_any_time - _log_angle_range(observation),
+                log_floor=math.log(settings.component_floor),
+                max_divergence=float(settings.max_divergence),
+                most=most,
+            )
+        ),
         stop.cell,
     )
     stop.check()
@@ -128,6 +140,7 @@ def make_factor(
         outlier=outlier,
         considered=max(bounds[-1], considered),
         omitted=omitted > 0 or len(taken) < len(parts),
+        dropped=dropped,
     )
 
 
@@ -170,7 +183,7 @@ def _good_kinds(
 
     Also gives the readings of clocks that these take in, as :data:`READING` has them.
     """
-    # Readings are not in the evidence yet; what each clock will cost, whatever it shows, is its even prior.
+    # Readings are not in the evidence yet; each clock's uniform prior lowers it, whatever the clock shows.
     log_clocks = -len({reading.clock for reading in observation.readings}) * math.log(max_path_length)
     kinds = []
     readings: list[tuple[int, float, float]] = []
@@ -218,7 +231,7 @@ def _widened(measured: Direction, scale: float) -> Direction:
 
 
 def _log_angle_range(observation: Observation) -> float:
-    """Logarithm of the range over which an angle that is an outlier is spread evenly, in the units of the factor."""
+    """Logarithm of the range over which an angle that is an outlier is uniform, in the units of the factor."""
     if observation.angle_index is None:
         return 0.0
     return math.log(2.0 * math.pi if observation.direction.zenith is None else 4.0 * math.pi)

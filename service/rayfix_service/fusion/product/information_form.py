@@ -1,15 +1,15 @@
-"""Gaussians over the state in natural form, one in each column, and kernels that treat all columns at once.
+"""Gaussians over the state in information form, one in each column, and kernels that treat all columns at once.
 
 The state is ``z = (x, clock offsets)``, of dimension d. A column holds one function
 
     exp(log_scale + eta . z - z . information . z / 2)
 
-as the lower triangle of ``information`` row by row, then ``eta``, then ``log_scale``. To multiply two such functions is
-to add their columns. Columns stand side by side, so that a kernel's innermost loop runs over them: compiled, it does
+as the lower triangle of ``information`` row by row, then ``eta``, then ``log_scale``. Two such functions are multiplied
+by adding their columns. Columns stand side by side, so that a kernel's innermost loop runs over them: compiled, it does
 several columns with each instruction, whatever d is.
 
-A function that says nothing of the position is constant over the whole free space, and says nothing of the clocks
-either; one that says nothing of a clock is constant over the clock's range. The diagonal of ``information`` is zero
+A function that does not constrain the position is constant over the whole free space, and does not constrain the clocks
+either; one that does not constrain a clock is constant over the clock's range. The diagonal of ``information`` is zero
 there.
 """
 
@@ -19,7 +19,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.gaussians.conditioning import LOG_2PI
+from rayfix_tables.gaussians.constants import LOG_2PI
+from rayfix_tables.gaussians.triangles import triangle
 
 Array = NDArray[np.float64]
 
@@ -52,12 +53,6 @@ def unpack(columns: Array) -> tuple[Array, Array, Array]:
 
 
 @numba.njit(cache=True, nogil=True)
-def triangle(size: Any) -> Any:
-    """Return the number of entries of the lower triangle of a matrix."""
-    return size * (size + 1) // 2
-
-
-@numba.njit(cache=True, nogil=True)
 def dimension_of(columns: Any) -> Any:
     """Return the dimension of the state of columns."""
     dimension = 3
@@ -77,7 +72,7 @@ def add(columns: Any, which: Any, others: Any, out: Any) -> None:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def integrate_last(columns: Any, size: Any, log_range: Any, det: Any, inverse: Any) -> None:
-    """Integrate the last of ``size`` variables out, in place; its rows are of no use then.
+    """Integrate the last of ``size`` variables out, in place; its rows are not valid afterwards.
 
     Parameters
     ----------

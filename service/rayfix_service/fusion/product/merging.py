@@ -1,8 +1,8 @@
-"""Merge alternatives and hypotheses that mean the same, so that the beam holds more of the posterior.
+"""Merge similar alternatives and hypotheses, so that the beam covers more of the posterior.
 
-Neighbouring tubes overlap once a measurement has cut them, and so do thousands of their products. Two that take the
-same measurements for outliers become one, with their moments, where that changes the mixture by no more than a stated
-divergence.
+Neighbouring tubes overlap once a measurement has conditioned them, and so do thousands of their products. Two that take
+the same measurements for outliers are replaced by one with their moments, if that changes the mixture by no more than a
+stated divergence.
 """
 
 from typing import Any
@@ -10,9 +10,10 @@ from typing import Any
 import numba
 import numpy as np
 
-from rayfix_service.fusion.product.information_form import dimension_of, invert_all, triangle
-from rayfix_tables.gaussians.conditioning import LOG_2PI
+from rayfix_service.fusion.product.information_form import dimension_of, invert_all
+from rayfix_tables.gaussians.constants import LOG_2PI
 from rayfix_tables.gaussians.tree_reduction import halve_and_merge
+from rayfix_tables.gaussians.triangles import pack_lower, triangle, unpack_lower
 
 _ONES = (1.0, 1.0, 1.0, 1.0)
 
@@ -29,7 +30,7 @@ def merge_gaussians(log_weight: Any, mean: Any, cov: Any, noise: Any, max_diverg
     mean : ndarray of shape (n, 4), m
     cov : ndarray of shape (n, 4, 4), m2
     noise : tuple of 4 floats, m2
-        Variances under which Gaussians are told apart.
+        Variances of the noise under which Gaussians are compared.
     max_divergence : float
         What a merge may cost, nats.
 
@@ -66,7 +67,7 @@ def merge_hypotheses(columns: Any, score: Any, pattern: Any, max_divergence: Any
     pattern : ndarray of int64, shape (h,)
         What each product takes for outliers; only those with the same are merged.
     max_divergence : float
-        What a merge may cost, nats.
+        What a merge may cost, nats. Those whose union rounding makes singular are not merged either.
 
     Returns
     -------
@@ -76,7 +77,7 @@ def merge_hypotheses(columns: Any, score: Any, pattern: Any, max_divergence: Any
     size = dimension_of(columns)
     packed, det = columns.copy(), np.empty(len(score))
     invert_all(packed, size, det)
-    # A hypothesis that leaves something open is no Gaussian.
+    # A hypothesis that leaves the position or a clock unconstrained is no Gaussian.
     proper = np.flatnonzero((score > -np.inf) & (det > 0.0))
     if len(proper) == 0:
         return np.arange(len(score))
@@ -93,13 +94,19 @@ def merge_hypotheses(columns: Any, score: Any, pattern: Any, max_divergence: Any
         into = halve_and_merge(weight, mean, cov, group, _ONES, NO_NOISE, max_divergence)
     else:
         into = halve_and_merge(weight, mean, cov, group, np.ones(size), np.zeros(size), max_divergence)
-    stays, has_grown = np.ones(len(score), np.bool_), np.zeros(len(proper), np.bool_)
+    has_grown = np.zeros(len(proper), np.bool_)
     for n in range(len(proper)):
         if into[n] != n:
-            stays[proper[n]] = False
             has_grown[into[n]] = weight[into[n]] > 0.0
     grown = np.flatnonzero(has_grown)
-    _write_back(columns, score, proper[grown], np.log(weight[grown] * total) + top, mean[grown], cov[grown])
+    regular = np.ones(len(proper), np.bool_)
+    regular[grown] = _write_back(
+        columns, score, proper[grown], np.log(weight[grown] * total) + top, mean[grown], cov[grown]
+    )
+    stays = np.ones(len(score), np.bool_)
+    for n in range(len(proper)):
+        if into[n] != n and regular[into[n]]:
+            stays[proper[n]] = False
     return np.flatnonzero(stays)
 
 
@@ -111,10 +118,7 @@ def _moments(columns: Any, packed: Any, which: Any) -> Any:
     mean, cov = np.zeros((len(which), size)), np.empty((len(which), size, size))
     for n in range(len(which)):
         h = which[n]
-        for i in range(size):
-            for j in range(i + 1):
-                cov[n, i, j] = packed[triangle(i) + j, h]
-                cov[n, j, i] = cov[n, i, j]
+        unpack_lower(packed, h, cov[n])
         for i in range(size):
             for j in range(size):
                 mean[n, i] += cov[n, i, j] * columns[first + j, h]
@@ -122,18 +126,17 @@ def _moments(columns: Any, packed: Any, which: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _write_back(columns: Any, score: Any, which: Any, log_weight: Any, mean: Any, cov: Any) -> None:
-    """Turn weighted Gaussians into columns, where their covariances are regular."""
+def _write_back(columns: Any, score: Any, which: Any, log_weight: Any, mean: Any, cov: Any) -> Any:
+    """Turn weighted Gaussians into columns where their covariances are positive definite; return where they are."""
     size = mean.shape[1]
     first = triangle(size)
     packed, det = np.empty((first, len(which))), np.empty(len(which))
     for n in range(len(which)):
-        for i in range(size):
-            for j in range(i + 1):
-                packed[triangle(i) + j, n] = cov[n, i, j]
+        pack_lower(cov[n], packed, n)
     invert_all(packed, size, det)
+    definite = det > 0.0
     for n in range(len(which)):
-        if not det[n] > 0.0:
+        if not definite[n]:
             continue
         h = which[n]
         score[h] = log_weight[n]
@@ -145,3 +148,4 @@ def _write_back(columns: Any, score: Any, which: Any, log_weight: Any, mean: Any
                 columns[row, h] = packed[row, n]
                 columns[first + i, h] += packed[row, n] * mean[n, j]
             columns[-1, h] -= 0.5 * columns[first + i, h] * mean[n, i]
+    return definite

@@ -17,9 +17,9 @@ class OutlierIndex(NamedTuple):
     Attributes
     ----------
     places : list of int
-        Of the used measurements in the report.
+        Indices of the used measurements in the report.
     rows : ndarray of int64, shape (r, 3)
-        Number of a measurement among ``places``, an observation, and the least that the observation's outlier must be.
+        Index of a measurement in ``places``, an observation, and the least value of the observation's outlier for it.
     """
 
     places: list[int]

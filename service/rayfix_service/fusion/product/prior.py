@@ -1,4 +1,4 @@
-"""Where the UE can be before anything is measured: evenly in the free space, or there about a known height.
+"""Prior of the position: uniform over the free space, or over the part of it about a known height.
 
 The prior density is ``exp(eta z - precision z^2 / 2 - log_volume)`` in the free space and zero elsewhere. Without a
 known height ``eta`` and ``precision`` are zero and ``log_volume`` is the logarithm of the free space's volume; with one
@@ -6,7 +6,7 @@ it is that of the integral of the exponential over the free space, which a sum o
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,14 +15,13 @@ from rayfix_tables.errors import ReportError
 from rayfix_tables.freespace import FreeSpace
 
 _LEAST_AREA = 1e-9
-"""A height of which less free area [m2] is left lies in a solid between two storeys."""
+"""A height with less free area [m2] than this lies in a solid between two storeys."""
 
 _FARTHEST = 6.0
 """A height farther than this many standard deviations from all free space is a mistake."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Prior:
+class Prior(NamedTuple):
     """Prior density of the position.
 
     Attributes
@@ -39,7 +38,7 @@ class Prior:
 
 
 def uniform_prior(free_space: FreeSpace) -> Prior:
-    """Prior of a UE of which nothing is known."""
+    """Prior of a UE of unknown height."""
     return Prior(log_volume=math.log(max(free_space.volume, 1.0)))
 
 

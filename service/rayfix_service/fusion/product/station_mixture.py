@@ -1,4 +1,4 @@
-"""What a station's part of the table says of a measured direction, as Gaussians over (position, path length)."""
+"""A station's mixture given a measured direction: Gaussians over (position, path length)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,11 +13,12 @@ from rayfix_service.fusion.lookup.lookup import Lookup, look_up
 from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
 from rayfix_service.fusion.measurements.line_of_sight import LineOfSightWeights
 from rayfix_service.fusion.product.merging import merge_gaussians
-from rayfix_tables.gaussians.conditioning import condition_on_angle
+from rayfix_tables.gaussians.conditioning import Conditioned, MeasuredCells, condition_on_angle
+from rayfix_tables.mixture import Tubes
 from rayfix_tables.table import StationPart
 
 _RANGE_STDEV = 0.1
-"""Noise of path lengths, m, under which paths of all directions are told apart."""
+"""Noise of path lengths, m, under which paths of all directions are compared."""
 
 _MAX_DIVERGENCE = 1e-4
 """What merging two of them may cost, nats: a path length picks a small part of them all."""
@@ -50,7 +51,7 @@ class StationMixture(NamedTuple):
         return StationMixture(self.log_evidence + log_weight, self.mean, self.cov)
 
     def merged(self) -> "StationMixture":
-        """Merge in place those that no path length tells apart."""
+        """Merge in place those that no path length distinguishes."""
         return self.those(merge_gaussians(*self, (0.0, 0.0, 0.0, _RANGE_STDEV**2), _MAX_DIVERGENCE))
 
 
@@ -92,7 +93,7 @@ class StationMixtures:
 
     @cached_property
     def everywhere(self) -> StationMixture:
-        """Gaussians of the paths of all directions, those merged that no path length tells apart."""
+        """Gaussians of the paths of all directions, those merged that no path length distinguishes."""
         return _condition(look_up(self.part.levels, NO_DIRECTION)).merged()
 
     @cached_property
@@ -106,37 +107,30 @@ class StationMixtures:
 def _condition(lookup: Lookup) -> StationMixture:
     """Condition every component of the cells looked up on the rest of the measured angle."""
     level = lookup.level
-    return StationMixture(
-        *_condition_cells(
-            *level.mixture.tubes,
-            level.log_balance,
-            level.cell_offsets,
-            level.cell_log_mass,
-            lookup.cells,
-            np.ascontiguousarray(lookup.rest_mean),
-            np.ascontiguousarray(lookup.rest_cov),
-            lookup.log_factor,
-        )
-    )
+    components = tuple(level.mixture.tubes), level.log_balance, level.cell_offsets, level.cell_log_mass
+    rest_mean, rest_cov = np.ascontiguousarray(lookup.rest_mean), np.ascontiguousarray(lookup.rest_cov)
+    return StationMixture(*_condition_cells(components, (lookup.cells, rest_mean, rest_cov, lookup.log_factor)))
 
 
 @numba.njit(cache=True, nogil=True)
-def _condition_cells(
-    log_weight: Any,
-    u_mean: Any,
-    u_cov: Any,
-    x_mean: Any,
-    jacobian: Any,
-    x_cov: Any,
-    log_balance: Any,
-    cell_offsets: Any,
-    cell_log_mass: Any,
-    cells: Any,
-    rest_mean: Any,
-    rest_cov: Any,
-    log_factor: Any,
-) -> Any:
-    """Make room for the components of some cells, and condition them; the arguments are those of level and lookup."""
+def _condition_cells(components: Any, looked_up: Any) -> Any:
+    """Condition the components of some cells. Plain tuples, since it takes numba 4 us to find out what a named one is.
+
+    Parameters
+    ----------
+    components : tuple
+        Of a level: :class:`~rayfix_tables.mixture.Tubes` as a tuple, ``log_balance``, ``cell_offsets``,
+        ``cell_log_mass``.
+    looked_up : tuple
+        The fields of a :class:`~rayfix_service.fusion.lookup.partition_of_unity.CellSum`.
+
+    Returns
+    -------
+    log_evidence, mean, cov : ndarray
+        As in :class:`StationMixture`.
+    """
+    tubes, log_balance, cell_offsets, cell_log_mass = components
+    cells, rest_mean, rest_cov, log_factor = looked_up
     count = len(cells)
     begins, ends, log_scale = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
     total = 0
@@ -144,38 +138,23 @@ def _condition_cells(
         begins[n], ends[n] = cell_offsets[cells[n]], cell_offsets[cells[n] + 1]
         log_scale[n] = log_factor[n] + cell_log_mass[cells[n]]
         total += ends[n] - begins[n]
-    log_evidence, mean, cov = np.empty(total), np.empty((total, 4)), np.empty((total, 4, 4))
-    condition_on_angle(
-        log_weight,
-        u_mean,
-        u_cov,
-        x_mean,
-        jacobian,
-        x_cov,
-        begins,
-        ends,
-        rest_mean,
-        rest_cov,
-        log_scale,
-        log_evidence,
-        mean,
-        cov,
-    )
+    out = Conditioned(np.empty(total), np.empty((total, 4)), np.empty((total, 4, 4)))
+    condition_on_angle(Tubes(*tubes), MeasuredCells(begins, ends, rest_mean, rest_cov, log_scale), out)
     if len(log_balance):
-        place = 0
+        row = 0
         for n in range(count):
             for k in range(begins[n], ends[n]):
-                log_evidence[place] += log_balance[k]
-                place += 1
-    return log_evidence, mean, cov
+                out.log_evidence[row] += log_balance[k]
+                row += 1
+    return out.log_evidence, out.mean, out.cov
 
 
 def is_direct(lookup: Lookup) -> NDArray[np.bool_]:
-    """Tell which components of the cells of a lookup, cell after cell, are of paths without a reflection.
+    """Find which components of the cells of a lookup, cell after cell, are of paths without a reflection.
 
     A component of several paths counts as the one that carries most of it.
     """
     offsets = lookup.level.cell_offsets
     begins, counts = offsets[lookup.cells], offsets[lookup.cells + 1] - offsets[lookup.cells]
-    places = np.repeat(begins - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
-    return np.asarray(lookup.level.mixture.num_reflections[places] == 0)
+    rows = np.repeat(begins - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
+    return np.asarray(lookup.level.mixture.num_reflections[rows] == 0)

@@ -1,4 +1,4 @@
-"""What is refused before anything else looks at a request: odd paths, foreign hosts, pages of other origins."""
+"""The first checks of a request: malformed paths, unknown hosts, pages of other origins."""
 
 import ipaddress
 from functools import lru_cache
@@ -17,7 +17,7 @@ _DEFAULT_PORTS = {"http": ":80", "https": ":443", "ws": ":80", "wss": ":443"}
 
 
 class Edge:
-    """Middleware that refuses what no proper client sends.
+    """Middleware that refuses requests that no regular client sends.
 
     A browser sends requests for any page that it shows. Where keys are asked for, a page of another origin has none; a
     service without keys takes the browser for one of its machine, so the page's origin and the name by which it calls
@@ -79,8 +79,8 @@ class Edge:
 
     def _check_origin(self, scope: Scope, origin: str | None, site: bytes | None) -> None:
         if origin is None:
-            # A page may have a browser fetch pictures or post forms without a word of its origin; who follows a link
-            # only looks.
+            # A page may have a browser fetch pictures or post forms without naming its origin; following a link
+            # only reads.
             looks = scope.get("method") in ("GET", "HEAD") and header(scope, b"sec-fetch-mode") == "navigate"
             fits = looks or site not in (b"cross-site", b"same-site")
         else:

@@ -46,7 +46,7 @@ class ApiKeys:
     def name_of(self, key: str) -> str | None:
         """Return the name of a key, None for one that is unknown.
 
-        All hashes are compared, each in constant time, so that the time tells nothing of them.
+        All hashes are compared, each in constant time, so that the time reveals nothing about them.
         """
         digest = _digest(key)
         found = None
@@ -99,7 +99,7 @@ class ApiKeys:
         except FileNotFoundError:
             return {}
         except OSError:
-            pass  # what reads it says why
+            pass  # whoever reads it reports the error
         return _read_hashes(self._path)
 
 

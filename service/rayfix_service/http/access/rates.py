@@ -4,44 +4,44 @@ import mmap
 from collections.abc import Callable
 from time import monotonic
 
-_PLACES = 4096
+_SLOTS = 4096
 _NEAR = 16
 
 
 class Accounts:
-    """When the bucket of each client is full again, in memory that processes forked from this one share.
+    """When the bucket of each client is full again, in memory common to all processes forked from this one.
 
-    A client stands at one of the places near the hash of its name, which is the same in all these processes; a place
-    whose bucket is full says nothing and is free. Nobody takes a lock, so that no process that is killed leaves one
-    behind: where two charge one client at the same moment, one charge may be lost.
+    It is a hash table: a client has one of the slots from the hash of its name on, which is the same in all these
+    processes; a slot whose bucket is full is free. There is no lock, so that a process that is killed leaves none
+    behind: where two charge one client at the same moment, one charge may be dropped.
     """
 
     def __init__(self) -> None:
-        memory = memoryview(mmap.mmap(-1, 2 * 8 * _PLACES))
-        self._clients = memory[: 8 * _PLACES].cast("q")
-        self._full_at = memory[8 * _PLACES :].cast("d")
+        memory = memoryview(mmap.mmap(-1, 2 * 8 * _SLOTS))
+        self._clients = memory[: 8 * _SLOTS].cast("q")
+        self._full_at = memory[8 * _SLOTS :].cast("d")
 
     def full_at(self, client: str, now: float) -> float:
         """Return when the client's bucket is full, ``now`` where it is."""
-        return max(self._full_at[self._place(hash(client), now)], now)
+        return max(self._full_at[self._slot(hash(client), now)], now)
 
     def set_full_at(self, client: str, time: float, now: float) -> None:
         """Note when the client's bucket will be full."""
         number = hash(client)
-        place = self._place(number, now)
-        self._clients[place] = number
-        self._full_at[place] = time
+        slot = self._slot(number, now)
+        self._clients[slot] = number
+        self._full_at[slot] = time
 
-    def _place(self, number: int, now: float) -> int:
-        """Where a client stands, else where it may; where none is free, it shares its first place with another."""
-        places = [place % _PLACES for place in range(number, number + _NEAR)]
+    def _slot(self, number: int, now: float) -> int:
+        """Slot of a client, or else a free one; where none is free, the first, which is another client's too."""
+        slots = [slot % _SLOTS for slot in range(number, number + _NEAR)]
         free = None
-        for place in places:
-            if self._full_at[place] <= now:
-                free = place if free is None else free
-            elif self._clients[place] == number:
-                return place
-        return places[0] if free is None else free
+        for slot in slots:
+            if self._full_at[slot] <= now:
+                free = slot if free is None else free
+            elif self._clients[slot] == number:
+                return slot
+        return slots[0] if free is None else free
 
 
 class RateLimit:
@@ -56,9 +56,9 @@ class RateLimit:
     burst : float
         At least 1.
     clock : callable
-        Returns seconds, the same in all processes that share the accounts.
+        Returns seconds, the same in all processes with these accounts.
     accounts : Accounts, optional
-        Of its own unless given.
+        New ones by default.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Long work for one request, with regard for the others and for the client."""
+"""Long work for one request, in parts between which other requests are answered."""
 
 import asyncio
 import logging
@@ -14,14 +14,14 @@ _log = logging.getLogger(__name__)
 
 
 class Cooperation:
-    """Lets other requests in between the parts of one, and looks whether its client is still there."""
+    """Lets other requests run between the parts of one, and checks whether its client is still connected."""
 
     def __init__(self, request: Request) -> None:
         self._request = request
         self._looked = monotonic()
 
     async def let_others_run(self) -> None:
-        """Let others in; to be awaited before each part.
+        """Let other requests run; to be awaited before each part.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The feed of fixes: every fix that is located, told to whoever listens."""
+"""The feed of fixes: every fix is sent to all listeners."""
 
 import asyncio
 from collections import deque
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from rayfix_service.http.settings import FeedLimits
 
 _RELAY_BYTES = 32 << 20
-"""Fixes that wait for another worker, which hears for all of its listeners."""
+"""Bytes of fixes that wait for another worker, which receives them for all of its listeners."""
 
 QUEUE_LENGTH = 256
 """Fixes that wait for a listener; of one that reads more slowly, the oldest are dropped."""
@@ -38,14 +38,14 @@ class FixEvent:
 
 
 class Subscription:
-    """What waits for one listener.
+    """The queue of one listener.
 
     Parameters
     ----------
     table, target_id : str, optional
-        The only table and the only target to hear of.
+        The only table and the only target whose fixes are wanted.
     own : bool
-        Whether to hear only of what this process located.
+        Whether only fixes of this process are wanted.
     backlog_bytes : int
         Beyond which the oldest of several waiting events are dropped.
     """
@@ -80,12 +80,12 @@ class Subscription:
         self._wake.set()
 
     def close(self) -> None:
-        """End it; what is queued may still be taken."""
+        """End the subscription; queued events may still be taken."""
         self.closed = True
         self._wake.set()
 
     async def wait(self, seconds: float) -> None:
-        """Wait until there is something to take, it is closed, or the time is over."""
+        """Wait until an event is queued, the subscription is closed, or the time is over."""
         try:
             async with asyncio.timeout(seconds):
                 await self._wake.wait()
@@ -103,7 +103,7 @@ class Subscription:
 
 
 class FixFeed:
-    """Hands the fixes of one process to its listeners. Of one event loop.
+    """Distributes the fixes of one process to its listeners, within one event loop.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class FixFeed:
 
     @property
     def num_listeners(self) -> int:
-        """How many listen to the fixes of all processes."""
+        """Number of listeners to the fixes of all processes."""
         return sum(not subscription.own for subscription in self._subscriptions)
 
     @property
@@ -142,12 +142,12 @@ class FixFeed:
             self._subscriptions.remove(subscription)
 
     def publish(self, table: str, target_id: str | None, make_data: Callable[[], bytes]) -> None:
-        """Tell of a fix of this process; its JSON is only made where someone listens."""
+        """Publish a fix of this process; its JSON is only written where there is a listener."""
         if self._subscriptions:
             self._put(self._event(table, target_id, make_data()), self._subscriptions)
 
     def pass_on(self, table: str, target_id: str | None, data: bytes) -> None:
-        """Tell of a fix that another process located."""
+        """Publish a fix of another process."""
         self._put(self._event(table, target_id, data), {s for s in self._subscriptions if not s.own})
 
     def _event(self, table: str, target_id: str | None, data: bytes) -> FixEvent:
@@ -159,7 +159,7 @@ class FixFeed:
             subscription.put(event)
 
     def close(self) -> None:
-        """End all subscriptions, and those that come."""
+        """End all subscriptions, and further ones at once."""
         self._closed = True
         for subscription in self._subscriptions:
             subscription.close()

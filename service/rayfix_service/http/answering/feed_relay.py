@@ -1,6 +1,6 @@
-"""The feed of fixes across worker processes: whoever listens hears of the fixes of all.
+"""The feed of fixes across worker processes: a listener gets the fixes of all.
 
-Each worker has a Unix socket in the folder that they share. One that has listeners connects to the others, which then
+Each worker has a Unix socket in their common folder. One that has listeners connects to the others, which then
 send it what they locate; where nobody listens, nothing is sent or written.
 """
 
@@ -28,19 +28,19 @@ class FeedRelay:
     feed : FixFeed
         Of this worker.
     folder : pathlib.Path
-        Folder that the workers share.
+        Common folder of the workers.
     """
 
     def __init__(self, feed: FixFeed, folder: Path) -> None:
         self._feed = feed
         self._folder = folder
         self._own = folder / f"feed-{os.getpid()}.sock"
-        self._hearing: dict[Path, asyncio.Task[None]] = {}
+        self._connections: dict[Path, asyncio.Task[None]] = {}
         self._lock = asyncio.Lock()
-        self._telling: set[asyncio.Task[None]] = set()
+        self._clients: set[asyncio.Task[None]] = set()
 
     async def keep(self) -> None:
-        """Serve the other workers, and stay connected to them while someone listens here; until it is cancelled."""
+        """Serve the other workers, and stay connected to them while there are listeners here; until it is cancelled."""
         server = await asyncio.start_unix_server(self._tell, self._own, limit=_LONGEST_LINE)
         try:
             while True:
@@ -48,11 +48,11 @@ class FeedRelay:
                 if self._feed.num_listeners:
                     await self.connect()
                 else:
-                    self._hang_up()
+                    self._disconnect()
         finally:
-            self._hang_up()
+            self._disconnect()
             server.close()
-            for task in self._telling:
+            for task in self._clients:
                 task.cancel()
             self._own.unlink(missing_ok=True)
 
@@ -63,7 +63,7 @@ class FeedRelay:
 
     async def _connect(self) -> None:
         for path in self._folder.glob("feed-*.sock"):
-            if path == self._own or (path in self._hearing and not self._hearing[path].done()):
+            if path == self._own or (path in self._connections and not self._connections[path].done()):
                 continue
             try:
                 async with asyncio.timeout(_SCAN_SECONDS):
@@ -72,14 +72,14 @@ class FeedRelay:
             except ConnectionRefusedError:
                 path.unlink(missing_ok=True)  # of a worker that was killed
             except (OSError, EOFError) as error:
-                _log.warning("another worker's fixes cannot be heard: %s", error)
+                _log.warning("another worker's fixes cannot be received: %s", error)
             else:
-                self._hearing[path] = asyncio.create_task(self._hear(reader, writer))
+                self._connections[path] = asyncio.create_task(self._hear(reader, writer))
 
-    def _hang_up(self) -> None:
-        for task in self._hearing.values():
+    def _disconnect(self) -> None:
+        for task in self._connections.values():
             task.cancel()
-        self._hearing.clear()
+        self._connections.clear()
 
     async def _hear(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Pass another worker's events on to the listeners."""
@@ -93,7 +93,7 @@ class FeedRelay:
         """Send another worker the events of this one."""
         task = asyncio.current_task()
         assert task is not None
-        self._telling.add(task)
+        self._clients.add(task)
         try:
             with contextlib.closing(writer), self._feed.subscribe(own=True) as subscription:
                 writer.write(_GREETING)
@@ -112,4 +112,4 @@ class FeedRelay:
         except (ConnectionError, asyncio.CancelledError):
             pass  # the other worker ended, or this one does
         finally:
-            self._telling.discard(task)
+            self._clients.discard(task)

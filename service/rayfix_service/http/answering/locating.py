@@ -13,9 +13,9 @@ from pydantic_core import from_json, to_json
 from rayfix_service.adapters.adapted import Adapted, error_in_message
 from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.omlox_hub import OmloxHub
-from rayfix_service.fusion.locator import Fused
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.fusion.posterior.fused import Fused
 from rayfix_service.fusion.stopping import NEVER
 from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.response_options import ResponseOptions
@@ -78,7 +78,7 @@ def foreign(adapted: Adapted) -> Incoming:
 
 
 class Located(NamedTuple):
-    """A fix, the track of its target if that is wanted, and the time that the fix took, s."""
+    """A fix, the track of its target if that is requested, and the time that the fix took, s."""
 
     fix: Fix
     track: TrackedPosition | None
@@ -87,18 +87,18 @@ class Located(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Answerer:
-    """What answers reports.
+    """Locates reports and writes the answers.
 
     Attributes
     ----------
     metrics : Metrics
         To add to.
     feed : FixFeed
-        To tell of fixes.
+        To publish fixes in.
     slow_work : SlowWork
         Threads for what takes longer, by its estimate, than ``quick_seconds``.
     hub : OmloxHub or None
-        To tell of positions.
+        To send positions to.
     quick_seconds : float
         What a fix may take on the event loop.
     reading : asyncio.Lock
@@ -113,7 +113,7 @@ class Answerer:
     reading: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def read(self, parse: Callable[[bytes], T], body: bytes) -> T:
-        """Parse a body: a long one in a thread, one at a time, so that others are answered meanwhile.
+        """Parse a body: long ones in a thread, one at a time, so that other requests are answered meanwhile.
 
         Raises
         ------
@@ -126,7 +126,7 @@ class Answerer:
             return await asyncio.to_thread(parse, body)
 
     async def answer(self, table: ServedTable, incoming: Incoming, options: ResponseOptions) -> dict[str, Any]:
-        """Locate a report with a table and write the answer as wanted.
+        """Locate a report with a table and write the answer in the requested format.
 
         Raises
         ------
@@ -136,7 +136,7 @@ class Answerer:
         return self.write(table, incoming, options, await self.locate(table, incoming, options))
 
     async def locate(self, table: ServedTable, incoming: Incoming, options: ResponseOptions) -> Located:
-        """Locate a report with a table, and follow its target if that is wanted.
+        """Locate a report with a table, and follow its target if that is requested.
 
         A fix that takes less than a millisecond or a few by its estimate, as most do, is made right on the event loop.
         In the thread pool that FastAPI has for "def" such fixes would wait for each other's GIL; more worker processes
@@ -172,7 +172,7 @@ class Answerer:
     def write(
         self, table: ServedTable, incoming: Incoming, options: ResponseOptions, located: Located
     ) -> dict[str, Any]:
-        """Tell who listens of a fix, and write the answer as wanted.
+        """Publish a fix, and write the answer in the requested format.
 
         Raises
         ------
@@ -204,12 +204,12 @@ def problem_of(error: Exception) -> dict[str, Any]:
             return report_problem(error)
         case ProblemError():
             return problem_document(error.kind, str(error))
-    # A defect that one report meets must not cost the other 999 their fix.
+    # A defect in one report's fix must not fail the other 999.
     _log.error("a report of several failed", exc_info=error)
     return internal_problem()
 
 
 def _event(table: str, incoming: Incoming, located: Located) -> bytes:
-    """Write what the feed tells of a fix."""
+    """Write the event of a fix for the feed."""
     fix = fix_to_document(located.fix, located.seconds, located.track)
     return to_json({"table": table, "report": incoming.native_document(), "fix": fix})

@@ -1,4 +1,4 @@
-"""What a request wants of its answers: their format, by query or Accept header, and whether targets are followed."""
+"""Options of a request for its answers: format, by query or Accept header, and whether targets are followed."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -22,7 +22,7 @@ MEDIA_TYPES: dict[str, OutputFormat] = {
 
 @dataclass(frozen=True, kw_only=True)
 class ResponseOptions:
-    """What a request wants.
+    """Options of a request.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class ResponseOptions:
     track : bool
         Whether targets are followed.
     must_track : bool
-        Whether the request itself says so: a report that cannot be followed is then refused.
+        Whether the request itself asks for it: a report that cannot be followed is then refused.
     """
 
     output: OutputFormat = "native"
@@ -48,7 +48,7 @@ class ResponseOptions:
 def response_options_of(
     scope: Scope, settings: ServiceSettings, output: OutputFormat | None = None, track: bool | None = None
 ) -> ResponseOptions:
-    """Return what a request wants by its query, else by its Accept header and the service's settings."""
+    """Read the options of a request from its query, else from its Accept header and the service's settings."""
     media_type = JSON
     if output is None:
         media_type, output = _accepted(header(scope, b"accept"))
@@ -80,7 +80,7 @@ def _accepted(accept: str | None) -> tuple[str, OutputFormat]:
 
 
 def _weight(text: str) -> float:
-    """Read a weight, 0 for what is none."""
+    """Read a weight; 0 for a text that is none."""
     try:
         weight = float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""The folder that the workers of a service share, gone with them, however they end."""
+"""The common folder of the workers of a service, removed with them, however they end."""
 
 import contextlib
 import os

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.http.answering.table_checks import TableChecks
 from rayfix_service.http.answering.table_files import FileState, FoundFiles, TableFiles, file_state, no_table
 from rayfix_service.http.problems import INVALID_PARAMETER, NOT_FOUND, NOT_READY, ProblemError
 from rayfix_service.http.telemetry.metrics import Metrics
+from rayfix_service.locator import Locator
 from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire import FieldProblem
 from rayfix_tables.checked import VERDICTS
@@ -57,7 +57,7 @@ class ServedTable:
 
 @dataclass(frozen=True, kw_only=True)
 class TableChange:
-    """What became of a table's file at a look at it; ``reason`` says why it was refused, without its folder."""
+    """Result of a check of a table's file; ``reason`` gives the cause of a refusal, without the file's folder."""
 
     name: str
     change: Change
@@ -110,7 +110,7 @@ def _warmed_up(served: ServedTable) -> ServedTable:
 
 
 def _serve(name: str, table: Table, state: FileState) -> ServedTable:
-    return ServedTable(name=name, locator=Locator(table), tracker=Tracker(table.scene), state=state)
+    return ServedTable(name=name, locator=Locator(table), tracker=Tracker(table), state=state)
 
 
 def load_tables(path: Path, *, checks: TableChecks | None = None) -> dict[str, ServedTable]:
@@ -138,14 +138,14 @@ def load_tables(path: Path, *, checks: TableChecks | None = None) -> dict[str, S
 
 
 def forget_changed(tables: dict[str, ServedTable]) -> None:
-    """Take out the tables whose files are no longer those that they were read from."""
+    """Remove the tables whose files have changed since they were read."""
     for name, served in list(tables.items()):
         if file_state(served.locator.table.path) != served.state:
             del tables[name]
 
 
 def follow_changes(tables: dict[str, ServedTable], path: Path, checks: TableChecks, *, failed: set[FileState]) -> None:
-    """Put tables in that workers have loaded since, and take out those whose files are gone.
+    """Add tables that workers have loaded since, and remove those whose files are gone.
 
     A table whose file has become another stays until a worker has loaded that: so there is always one that can answer
     for whoever is forked next.
@@ -187,7 +187,7 @@ class Tables:
         A table, or a folder of tables.
     metrics : Metrics
     runtime_folder : pathlib.Path, optional
-        Folder through which the workers of one service tell each other to look at all files.
+        Folder through which the workers of one service ask each other to check all files.
     at_hand : dict of str to ServedTable, optional
         Tables that are loaded already, by name. One whose file has not changed since is served at once, and one whose
         file has become a bad one, too. Each is taken out, so that nothing holds it when it is swapped.
@@ -270,7 +270,7 @@ class Tables:
         )
 
     async def keep(self, seconds: float) -> None:
-        """Load all tables, then for ever what is new.
+        """Load all tables, then new ones until cancelled.
 
         A changed file is looked at once it has not changed between two looks.
 
@@ -285,7 +285,7 @@ class Tables:
             _log.critical("not ready", exc_info=True)
             changes = [TableChange(name="", change="refused")]
         if not self.became_ready.is_set() and any(change.change == "refused" for change in changes):
-            self._failure = "a table does not pass its check, the log says why; replace it"
+            self._failure = "a table does not pass its check, the log has the cause; replace it"
         before = dict(self._looked_at)
         try:
             while True:
@@ -299,7 +299,7 @@ class Tables:
                 task.cancel()
 
     async def refresh(self, *, again: bool = False) -> list[TableChange]:
-        """Look at all files; load those that are new.
+        """Check all files; load those that are new.
 
         Parameters
         ----------
@@ -321,7 +321,7 @@ class Tables:
         return changes
 
     async def reload(self) -> list[TableChange]:
-        """Look at all files, and tell the other workers to."""
+        """Check all files, and ask the other workers to."""
         changes = await self.refresh(again=True)
         if self._marker is not None:
             self._marker.write_bytes(b"")
@@ -358,7 +358,7 @@ class Tables:
         return name in self._refused and self._refused[name].state == state
 
     def _tell_unfit(self, found: FoundFiles) -> list[TableChange]:
-        """Refuse what cannot be a table by its name or kind, once; forget what is no longer there."""
+        """Refuse files that cannot be tables by name or kind, once; forget those that are gone."""
         if found.files:
             for name in self._refused.keys() - found.files.keys() - found.unfit.keys():
                 del self._refused[name]
@@ -430,9 +430,9 @@ class Tables:
         if isinstance(error, RayfixError | OSError):
             reason = str(error).replace(str(path), path.name)
         else:
-            reason = f"{path.name} cannot be loaded; the log says why"
+            reason = f"{path.name} cannot be loaded; the log has the cause"
         if isinstance(error, TableError) and not isinstance(error, VERDICTS) and state is not None:
-            # It may be over soon: no memory for the check, no right to read the file.
+            # The cause may be temporary: no memory for the check, no permission to read the file.
             self._looked_at.pop(name, None)
             self._not_before[name] = asyncio.get_running_loop().time() + _AGAIN_SECONDS
         before, self._refused[name] = self._refused.get(name), Refusal(state=state, reason=reason)
@@ -440,7 +440,7 @@ class Tables:
         self._become_ready()
         change = TableChange(name=name, change="refused", reason=reason)
         if before == self._refused[name]:
-            return change  # said already
+            return change  # logged already
         self._metrics.table_refused()
         if isinstance(error, RayfixError | OSError):
             _log.error("table refused: %s", error)

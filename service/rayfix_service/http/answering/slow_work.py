@@ -18,7 +18,7 @@ class Stoppable(Protocol[Asked_contra, T_co]):
     """Work that ends early, by a :class:`FixStoppedError`, once ``stop`` is set."""
 
     def __call__(self, asked: Asked_contra, /, *, stop: Stop) -> T_co:
-        """Do it."""
+        """Do the work."""
 
 
 class SlowWork:
@@ -46,7 +46,7 @@ class SlowWork:
         return self._under_way
 
     async def run(self, work: Callable[[], T]) -> T:
-        """Do in a thread what cannot be stopped, but takes well below a second.
+        """Do work in a thread that cannot be stopped, but takes well below a second.
 
         Raises
         ------
@@ -61,7 +61,7 @@ class SlowWork:
         return await self.locate(do, None)
 
     async def locate(self, locate: Stoppable[Asked_contra, T], report: Asked_contra) -> T:
-        """Locate a report in a thread, or do what takes as long with something else that was asked.
+        """Locate a report in a thread, or do other work of similar length.
 
         Raises
         ------
@@ -83,21 +83,21 @@ class SlowWork:
         work = loop.run_in_executor(self._executor, partial(locate, report, stop=stop))
         work.add_done_callback(self._done)
         try:
-            # A thread cannot be ended: what is given up keeps its place among those under way until it has stopped.
+            # A thread cannot be ended: what is given up counts as under way until it has stopped.
             return await asyncio.wait_for(asyncio.shield(work), self._seconds)
         except (TimeoutError, FixStoppedError):
             raise ProblemError(
                 FIX_TIMEOUT, f"the fix took longer than {self._seconds:g} s; send fewer measurements"
             ) from None
         finally:
-            # Also when nobody waits any more.
+            # Also when the request was cancelled.
             stop.set()
             work.cancel()  # if it has not begun
 
     def _done(self, work: "asyncio.Future[T]") -> None:
         self._under_way -= 1
         if not work.cancelled():
-            work.exception()  # seen, also of one that was given up
+            work.exception()  # retrieved, also of one that was given up
 
     def close(self) -> None:
         """End the threads."""

@@ -32,7 +32,7 @@ class TableChecks:
     Parameters
     ----------
     folder : pathlib.Path, optional
-        Folder that the workers of a service share. What one of them has checked, the others do not check again.
+        Common folder of the workers of a service. What one of them has checked, the others do not check again.
     limits : CheckLimits, optional
         What a check may take.
     """
@@ -66,7 +66,7 @@ class TableChecks:
             return table_of_verdict(opened, verdict), opened.state
 
     def note_loaded(self, path: Path, state: FileState) -> None:
-        """Tell the other processes that a table has passed its check and could be loaded."""
+        """Record for the other processes that a table has passed its check and could be loaded."""
         if self._folder is not None:
             with contextlib.suppress(OSError):
                 (self._folder / f"{_key(path, state)}.loaded").touch()

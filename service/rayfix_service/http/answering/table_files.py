@@ -1,4 +1,4 @@
-"""The files that tables come from: looked at, and not opened."""
+"""The files that tables come from: listed, and not opened."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ from rayfix_tables.disk.files import state_of, why_not_regular
 from rayfix_tables.errors import TableError
 
 FileState = PresentState | None
-"""What tells one version of a file from the next: inode, size and time; None for a missing file."""
+"""What distinguishes versions of a file: inode, size and time; None for a missing file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class TableFiles:
     path: Path
 
     def look(self) -> FoundFiles:
-        """Look which files there are, and in which version.
+        """List the files and their versions.
 
         Raises
         ------
@@ -72,7 +72,7 @@ class TableFiles:
         return found.files
 
     def states(self) -> dict[str, FileState]:
-        """Look which files there are and in which version; empty where the folder has none."""
+        """List the files and their versions; empty where the folder has none."""
         try:
             return self.look().states
         except OSError:
@@ -80,30 +80,30 @@ class TableFiles:
 
 
 def no_table(path: Path, found: FoundFiles) -> TableError:
-    """Return the error of a place where no file can be a table."""
+    """Return the error of a path at which no file can be a table."""
     if found.unfit:
         return TableError(next(iter(found.unfit.values())))
     return TableError(f"there is no table in {path}; put files T.h5 that 'rayfix build' wrote there")
 
 
 def why_unfit(path: Path) -> str | None:
-    """Say why a file cannot be a table, from its name and kind alone; None for one that can."""
-    if not path.stem.isprintable():  # names are told in logs, figures and answers
+    """Return why a file cannot be a table, from its name and kind alone; None for one that can."""
+    if not path.stem.isprintable():  # names appear in logs, figures and answers
         return f"{shown_name(path.name)} has characters in its name that cannot be shown; rename it"
     try:
         what = why_not_regular(path)
-    except OSError:  # said when it is opened
+    except OSError:  # reported when it is opened
         return None
     return None if what is None else f"{path} {what} and no table; take it away"
 
 
 def shown_name(name: str) -> str:
-    """Name of a file as it can be told: with escapes where it is no printable Unicode."""
+    """Name of a file for messages: with escapes where it is no printable Unicode."""
     return name if name.isprintable() else ascii(name)[1:-1]
 
 
 def file_state(path: Path) -> FileState:
-    """Tell this version of a file from others."""
+    """Return what distinguishes this version of a file."""
     try:
         return state_of(path.stat())
     except OSError:

@@ -55,7 +55,7 @@ REPORT_EXAMPLES: dict[str, dict[str, Any]] = {
         },
     },
     "unsynchronised_clock": {
-        "summary": "Angles, and times of arrival that share an unknown clock offset",
+        "summary": "Angles, and times of arrival with a common unknown clock offset",
         "value": {
             "measurements": [
                 _AOA_1,
@@ -260,7 +260,7 @@ def _silabs(locator_id: str, azimuth: float, elevation: float) -> dict[str, Any]
 # The hall's stations are turned by 45, 135 and -135 deg; clockwise azimuths count from there.
 SILABS_EXAMPLES: dict[str, dict[str, Any]] = {
     "three_locators": {
-        "summary": "One packet, heard by three locators",
+        "summary": "One packet, received by three locators",
         "value": {
             "target_id": "ble-pd-60A423C96B9A",
             "stations": {"ble-pd-0C4314F46CDC": "bs1", "ble-pd-0C4314F46D0B": "bs2", "ble-pd-0C4314F46B25": "bs3"},
@@ -276,7 +276,7 @@ SILABS_EXAMPLES: dict[str, dict[str, Any]] = {
 
 UBLOX_EXAMPLES: dict[str, dict[str, Any]] = {
     "three_anchors": {
-        "summary": "One transmission of a tag, heard by three anchors whose ids are those of stations",
+        "summary": "One transmission of a tag, received by three anchors whose ids are those of stations",
         "value": """\
 +UUDF:6C1DEBA5F60C,-53,15,-6,0,37,"bs1","",1437347,40871
 +UUDF:6C1DEBA5F60C,-50,33,-13,0,37,"bs2","",238777,40871

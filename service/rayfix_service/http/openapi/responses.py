@@ -1,4 +1,4 @@
-"""What routes of positions share: their part of the OpenAPI document."""
+"""The common part of the OpenAPI document for routes of positions."""
 
 from collections.abc import Mapping
 from typing import Any, Literal

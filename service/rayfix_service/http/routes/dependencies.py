@@ -127,7 +127,7 @@ LinesBody = Annotated[bytes, Depends(body_reader(lambda limits: limits.report, t
 
 
 def _require_json(content_type: str | None) -> None:
-    if content_type == "application/json":  # as nearly all say
+    if content_type == "application/json":  # as nearly all requests have it
         return
     media_type = _media_type(content_type)
     if media_type == "application/json" or (media_type.startswith("application/") and media_type.endswith("+json")):

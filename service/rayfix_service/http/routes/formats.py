@@ -24,6 +24,7 @@ from rayfix_service.http.openapi.responses import (
 from rayfix_service.http.problems import MALFORMED_JSON, Problem
 from rayfix_service.http.routes.dependencies import AnswererDep, LinesBody, ReportBody, ResponseOptionsDep, TableDep
 from rayfix_service.http.routes.json_answer import JsonAnswer
+from rayfix_service.http.routes.one_report import answer_one
 
 router = APIRouter(prefix="/v1/positions", tags=["formats"])
 
@@ -47,8 +48,7 @@ async def post_nrppa(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    incoming = foreign(await answerer.read(parse_nrppa, body))
-    return JsonAnswer(await answerer.answer(table, incoming, options), media_type=options.media_type)
+    return await answer_one(lambda text: foreign(parse_nrppa(text)), body, answerer, table, options)
 
 
 @router.post(
@@ -62,8 +62,7 @@ async def post_silabs(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    incoming = foreign(await answerer.read(parse_silabs, body))
-    return JsonAnswer(await answerer.answer(table, incoming, options), media_type=options.media_type)
+    return await answer_one(lambda text: foreign(parse_silabs(text)), body, answerer, table, options)
 
 
 @router.post(

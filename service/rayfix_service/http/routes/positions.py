@@ -25,6 +25,7 @@ from rayfix_service.http.routes.dependencies import (
     read_body,
 )
 from rayfix_service.http.routes.json_answer import JsonAnswer, write_json
+from rayfix_service.http.routes.one_report import answer_one
 from rayfix_service.http.services import services_in
 from rayfix_service.wire import BatchDocument, MalformedJsonError, ReportDocument
 from rayfix_service.wire.batches import split_batch
@@ -56,9 +57,7 @@ async def post_position(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
-    return JsonAnswer(
-        await answerer.answer(table, await answerer.read(native, body), options), media_type=options.media_type
-    )
+    return await answer_one(native, body, answerer, table, options)
 
 
 async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple[bytes, str]:

@@ -66,7 +66,7 @@ class EventStreamResponse(StreamingResponse):
         200: {
             "description": "Server-sent events until the client leaves. Each event `fix` has a count as its `id` and "
             "an object with `table`, `report` and `fix` as its data. A listener that reads too slowly loses the oldest "
-            'fixes and is told by an event `dropped` with the data `{"dropped": 7}`. Comments keep it open.',
+            'fixes and gets an event `dropped` with the data `{"dropped": 7}`. Comments keep it open.',
             "content": {
                 "text/event-stream": {
                     "schema": {"type": "string"},
@@ -81,8 +81,8 @@ class EventStreamResponse(StreamingResponse):
 async def get_fixes(
     request: Request,
     services: ServicesDep,
-    table: Annotated[str | None, Query(description="the only table to hear of")] = None,
-    target_id: Annotated[str | None, Query(description="the only target to hear of", max_length=256)] = None,
+    table: Annotated[str | None, Query(description="the only table whose fixes are sent")] = None,
+    target_id: Annotated[str | None, Query(description="the only target whose fixes are sent", max_length=256)] = None,
 ) -> EventStreamResponse:
     """Tell of every fix that the service makes from now on, by whichever route its report came."""
     services.tables.all()  # none answers before it is ready

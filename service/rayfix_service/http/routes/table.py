@@ -1,4 +1,4 @@
-"""Routes that tell what the table holds."""
+"""Routes that describe the table."""
 
 from fastapi import APIRouter
 from pydantic import BaseModel

@@ -41,8 +41,8 @@ class Droppable(Protocol):
 class Crowd:
     """Keeps the connections of one worker within their number.
 
-    One too many takes the place of that which has waited longest for a request. Where none waits, a few more are taken,
-    so that who looks whether the process answers gets an answer.
+    A connection above the limit replaces the one that has waited longest for a request. Where none waits, a few more
+    are accepted, so that health checks get an answer.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Crowd:
         self._told_at = -_TELL_SECONDS
 
     def enter(self, connection: Droppable, count: int) -> bool:
-        """Take a connection, of ``count`` with it; tell whether it is beyond the limit and none gave way."""
+        """Accept a connection, the ``count``-th; return whether it is above the limit and none was closed for it."""
         if count - len(self._spare) > self.limits.connections:
             if self._waiting:
                 self._drop_oldest(self._waiting)

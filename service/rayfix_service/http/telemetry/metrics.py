@@ -16,7 +16,7 @@ from rayfix_service.tracking.track import TrackState
 from rayfix_tables.table import Table
 
 MULTIPROCESS_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
-"""Environment variable of prometheus-client: folder where several processes share their figures."""
+"""Environment variable of prometheus-client: folder for the figures of several processes."""
 
 _ACCEPTABLE = re.compile(
     r"[ \t]*[a-z*]+/[a-z*.+-]+"
@@ -179,15 +179,15 @@ def _table_labels(name: str, table: Table) -> tuple[str, ...]:
 
 
 def share_figures() -> None:
-    """Keep figures that are made from now on where ``MULTIPROCESS_VARIABLE`` says, in files of this process.
+    """Keep figures that are created from now on in files of this process, in the folder of ``MULTIPROCESS_VARIABLE``.
 
-    prometheus-client looks whether it is set when it is imported, which is before there are workers.
+    prometheus-client reads the variable when it is imported, which is before there are workers.
     """
     values.ValueClass = values.get_value_class()  # type: ignore[no-untyped-call]
 
 
 def forget_dead_workers() -> None:
-    """Take out of the shared folder what processes that have ended said of the present."""
+    """Remove the gauges of processes that have ended from the common folder."""
     folder = os.environ.get(MULTIPROCESS_VARIABLE)
     if folder is None:
         return

@@ -1,4 +1,4 @@
-"""What surrounds every request: its identifier, its place in log and figures, and an answer whatever goes wrong."""
+"""What surrounds every request: its identifier, its log line and figures, and an answer to every error."""
 
 import asyncio
 import logging

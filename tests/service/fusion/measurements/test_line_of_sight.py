@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.lookup.lookup import look_up
 from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
 from rayfix_service.fusion.measurements.line_of_sight import LineOfSightWeights
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.product.station_mixture import StationMixtures, is_direct
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 from tests.support.hand_reports import EXACT, angle_of
 from tests.support.hand_tables import POSITIONS, UE, MakeTable, Tube, line_of_sight

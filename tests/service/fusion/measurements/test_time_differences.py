@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import (
     GAUSSIAN,
     HEAVY_TAILED,
@@ -16,6 +15,7 @@ from rayfix_service.fusion.measurements.report import (
     TimeOfArrival,
 )
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.locator import Locator
 from tests.support.gaussian_oracle import Product
 from tests.support.hand_reports import EXACT, TUBES, differences, measured, report_of
 from tests.support.hand_tables import MakeTable

@@ -8,11 +8,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Angle, Height, Report, TimeOfArrival
 from rayfix_service.fusion.posterior.posterior import Posterior, free_shares, make_posterior
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_prior
+from rayfix_service.locator import Locator
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Table
 from tests.support import kernel_twins

@@ -17,10 +17,10 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from rayfix.cli import main
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.http.access.keys import ApiKeys, add_key
 from rayfix_service.http.access.rates import RateLimit
 from rayfix_service.http.errors import ServiceError
+from rayfix_service.locator import Locator
 from tests.support.reports import REPORT
 from tests.support.running_app import RunningApp
 from tests.support.server_process import start_server

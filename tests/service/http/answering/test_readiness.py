@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rayfix_service.fusion.locator import Locator
+from rayfix_service.locator import Locator
 from rayfix_service.server.server import serve
 from rayfix_tables.errors import TableError
 from tests.support.damage import flip_a_bit

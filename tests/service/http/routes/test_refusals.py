@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.http.settings import BodyLimits
+from rayfix_service.locator import Locator
 from tests.support.measurements import TDOA
 from tests.support.problems import problem_of
 from tests.support.reports import REPORT, changed

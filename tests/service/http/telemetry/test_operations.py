@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.posterior.fix import Fix, Outcome
 from rayfix_service.http.openapi.examples import BATCH_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.http.telemetry.logs import JsonFormatter, log_config
 from rayfix_service.http.telemetry.metrics import Metrics
 from rayfix_service.http.telemetry.request_context import ACCESS_LOGGER, REQUEST_ID, RequestContext
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 from tests.support.checkout import ROOT
 from tests.support.reports import REPORT

@@ -10,6 +10,8 @@ import numpy as np
 def log_sum(values: Any) -> Any:
     """Logarithm of the sum of numbers that are given by their logarithms."""
     top = values.max()
+    if top == -np.inf:
+        return top
     total = 0.0
     for n in range(len(values)):
         total += np.exp(values[n] - top)
@@ -18,13 +20,13 @@ def log_sum(values: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def cholesky(matrix: Any, lower: Any) -> Any:
-    """Cholesky factor into ``lower``; False when the matrix is not positive definite."""
+    """Cholesky factor into ``lower``; False when the matrix is not positive definite or not finite."""
     size = len(matrix)
     for j in range(size):
         pivot = matrix[j, j]
         for k in range(j):
             pivot -= lower[j, k] * lower[j, k]
-        if not pivot > 0.0:
+        if not 0.0 < pivot < np.inf:
             return False
         root = np.sqrt(pivot)
         lower[j, j] = root

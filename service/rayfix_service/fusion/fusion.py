@@ -1,0 +1,135 @@
+"""Fuse the measurements of a report: the product of their likelihoods and of the prior."""
+
+from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
+from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.posterior.fixes import Product
+from rayfix_service.fusion.product.beam import multiply
+from rayfix_service.fusion.product.cost import CostEstimate
+from rayfix_service.fusion.product.factors import Factor, make_factor
+from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_prior
+from rayfix_service.fusion.product.station_mixture import StationMixtures
+from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.fusion.stopping import NEVER, Stop
+from rayfix_tables.table import Table
+
+_NO_RAYS = "no ray of station '{}' comes from that direction"
+
+_TOO_MUCH = "left out: the measurements before it need all the work that one report may take; send fewer at once"
+
+_FEWER_ERRORS = (
+    "of {} paths the less probable combinations of errors were left out, since there were too many; send fewer "
+    "measurements of one path whose errors are heavy-tailed or log-normal"
+)
+
+_FEWER_HYPOTHESES = (
+    "less probable hypotheses were left out, since there were too many products to form; send fewer measurements, or "
+    "time differences that are connected"
+)
+
+_SINGULAR = (
+    "{} Gaussians were left out, since rounding made their covariances singular; give standard deviations that differ "
+    "less in size"
+)
+
+
+class Fusion:
+    """Multiplies the measurements of reports, with what follows from a table and is worked out once.
+
+    Parameters
+    ----------
+    table : Table
+    settings : FusionSettings
+    """
+
+    def __init__(self, table: Table, settings: FusionSettings) -> None:
+        self.table = table
+        self.settings = settings
+        self._uniform_prior = uniform_prior(table.scene.free_space)
+        self._stations = {name: StationMixtures(part) for name, part in table.parts.items()}
+        largest = max((part.levels[-1].num_components for part in table.parts.values()), default=0)
+        self._most_considered = max(self.settings.most_considered, self.settings.considered_tables * largest)
+        self._cost = CostEstimate(self._stations, self.settings)
+
+    def seconds(self, report: Report) -> float:
+        """Estimate how long a fix of a report will take, s, within some microseconds.
+
+        The estimate separates quick fixes from slow ones; it is infinite for a report that is slow in any case.
+        """
+        return self._cost.seconds(report)
+
+    def product(self, report: Report, stop: Stop = NEVER) -> Product:
+        """Multiply the likelihoods of the measurements of a report.
+
+        Parameters
+        ----------
+        report : Report
+        stop : Stop
+            Ends it early, from another thread.
+
+        Raises
+        ------
+        ReportError
+            When the report cannot be used; its ``path`` names the field.
+        FixStoppedError
+            When it was stopped.
+        """
+        sorted_report = sort_report(report, self.table.site)
+        free_space = self.table.scene.free_space
+        prior = self._uniform_prior if report.height is None else height_prior(report.height, free_space)
+        unused = dict(sorted_report.unused)
+        observations, factors = self._factors(sorted_report, prior, unused, stop)
+        hypotheses = None
+        if factors:
+            hypotheses = multiply(
+                factors,
+                max_path_length=self.table.site.max_path_length,
+                prior=prior,
+                width=self.settings.beam_width,
+                max_divergence=self.settings.max_divergence,
+                most_products=self.settings.most_products,
+                stop=stop,
+            )
+        simplified = []
+        if bounded := sum([factor.omitted for factor in factors]):
+            simplified.append(_FEWER_ERRORS.format(bounded))
+        if hypotheses is not None and hypotheses.omitted:
+            simplified.append(_FEWER_HYPOTHESES)
+        if hypotheses is not None and hypotheses.dropped:
+            simplified.append(_SINGULAR.format(hypotheses.dropped))
+        return Product(observations, unused, prior, hypotheses, tuple(simplified))
+
+    def _factors(
+        self, sorted_report: SortedReport, prior: Prior, unused: dict[int, str], stop: Stop
+    ) -> tuple[list[Observation], list[Factor]]:
+        """Factors of the observations that can contribute; why others cannot goes to ``unused``."""
+        observations, factors = [], []
+        unused_differences: dict[int, str] = {}
+        left, count = self._most_considered, len(sorted_report.observations)
+        for index, observation in enumerate(sorted_report.observations):
+            factor = None
+            if left > 0:
+                factor = make_factor(
+                    observation,
+                    self._stations[observation.station_id],
+                    num_clocks=sorted_report.num_clocks,
+                    max_path_length=self.table.site.max_path_length,
+                    prior=prior,
+                    settings=self.settings,
+                    most_considered=left // (count - index),
+                    stop=stop,
+                )
+            if factor is not None:
+                left -= factor.considered
+                observations.append(observation)
+                factors.append(factor)
+                continue
+            reason = _NO_RAYS.format(observation.station_id) if left > 0 else _TOO_MUCH
+            for measured in (observation.angle_index, *observation.timing_indices):
+                if measured is not None:
+                    unused[measured] = reason
+            unused_differences |= dict.fromkeys(observation.differences, reason)
+        # A time difference belongs to two paths, and contributes as long as one of them does.
+        if unused_differences:
+            contributing = {n for o in observations for n in o.differences}
+            unused |= {n: unused_differences[n] for n in unused_differences.keys() - contributing}
+        return observations, factors

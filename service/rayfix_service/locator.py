@@ -1,0 +1,143 @@
+"""Positions of reports, by a table."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rayfix_service.batch import locate_batch
+from rayfix_service.fusion.fusion import Fusion
+from rayfix_service.fusion.measurements.checks import check_report
+from rayfix_service.fusion.measurements.report import Angle, Range, Report
+from rayfix_service.fusion.posterior.credible import CredibleRegions
+from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.fusion.posterior.fixes import make_fix
+from rayfix_service.fusion.posterior.fused import Fused
+from rayfix_service.fusion.posterior.points import DrawnPoints
+from rayfix_service.fusion.posterior.posterior import Posterior, make_posterior
+from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.fusion.stopping import NEVER, Stop
+from rayfix_service.wire import parse_report
+from rayfix_tables.errors import ReportError
+from rayfix_tables.table import Table
+
+
+class Locator:
+    """Answers reports from a table.
+
+    Parameters
+    ----------
+    table : Table
+        From ``rayfix.build`` or ``rayfix.Table.open``.
+    settings : FusionSettings, optional
+
+    Raises
+    ------
+    TypeError
+        When the table is something else, such as the path of one.
+    """
+
+    def __init__(self, table: Table, settings: FusionSettings | None = None) -> None:
+        if not isinstance(table, Table):
+            raise TypeError(f"a Locator needs an open table, not {table!r}; open the file with rayfix.Table.open(path)")
+        self.table = table
+        self.settings = settings or FusionSettings()
+        self._fusion = Fusion(table, self.settings)
+
+    def locate(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Fix:
+        """Fuse the measurements of a report.
+
+        Parameters
+        ----------
+        report : Report or mapping
+            A mapping has the form of the JSON that ``POST /v1/positions`` takes.
+        stop : Stop
+            Ends it early, once another thread calls ``stop.set()``.
+
+        Raises
+        ------
+        ReportError
+            When the report cannot be used; its ``path`` names the field.
+        FixStoppedError
+            When it was stopped.
+        """
+        report = _read(report)
+        return make_fix(report, self._fusion.product(report, stop), self.table, self.settings, stop)
+
+    def locate_batch(self, reports: Sequence[Report | Mapping[str, Any]], *, jobs: int = -1) -> list[Fix | ReportError]:
+        """Fuse the measurements of many reports, on several processor cores.
+
+        Parameters
+        ----------
+        reports : sequence of Report or mapping
+            As of :meth:`locate`.
+        jobs : int
+            Processes; -1 for one per core. With 1, everything happens in this one, as it does with 64 reports or fewer.
+            Others start with the first call, within seconds, and wait for the next for some minutes.
+
+        Returns
+        -------
+        list of Fix or ReportError
+            Of each report in turn what :meth:`locate` returns or raises.
+
+        Raises
+        ------
+        TableError
+            When the file of the locator's table is no longer that table.
+        RayfixError
+            When a process ends early.
+        """
+        return locate_batch(self, reports, jobs=jobs)
+
+    def fuse(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Fused:
+        """Locate a report and keep its likelihood, for :class:`~rayfix_service.tracking.tracker.Tracker`.
+
+        Parameters
+        ----------
+        report : Report or mapping
+        stop : Stop
+            As of :meth:`locate`, and so are the errors.
+        """
+        report = _read(report)
+        product = self._fusion.product(report, stop)
+        fix = make_fix(report, product, self.table, self.settings, stop)
+        return Fused(fix=fix, hypotheses=product.hypotheses, prior=product.prior)
+
+    def posterior(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Posterior:
+        """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.
+
+        Parameters
+        ----------
+        report : Report or mapping
+        stop : Stop
+            As of :meth:`locate`, and so are the errors.
+        """
+        product = self._fusion.product(_read(report), stop)
+        return make_posterior(product.hypotheses, product.prior, self.table.scene.free_space, stop)
+
+    def seconds(self, report: Report) -> float:
+        """Estimate how long a fix of a report will take, s, within some microseconds.
+
+        The estimate separates quick fixes from slow ones; it is infinite for a report that is slow in any case.
+        """
+        return self._fusion.seconds(report)
+
+    def warm_up(self) -> None:
+        """Compile the kernels and prepare reports without angles, by locating a report of each kind."""
+        window = self.table.parts[self.table.site.stations[0].id].levels[0].window
+        for station in self.table.site.stations:
+            length = Range(station_id=station.id, path_length=5.0, stdev=0.5)
+            self.locate(Report(measurements=(length,)))
+            self.seconds(Report(measurements=(length,)))
+            for stdev in (0.5 * window, window):  # looked up in one cell and in several
+                angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=stdev, zenith_stdev=stdev)
+                self.locate(Report(measurements=(angle, length)))
+        points = DrawnPoints(mean=np.zeros((1, 3)), root=np.eye(3)[None], owner=np.zeros(8, np.int16))
+        regions = CredibleRegions(position=np.zeros(3), covariance=np.eye(3), points=points, share=1.0)
+        regions.upright_ellipsoid(0.5)
+        _ = regions.accuracies(0.5).ellipsoid.semi_axes
+
+
+def _read(report: Report | Mapping[str, Any]) -> Report:
+    """Check a report, or read one from a mapping."""
+    return check_report(report) if isinstance(report, Report) else parse_report(report)
