@@ -9,11 +9,21 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_service.fusion.posterior.saddles import squared_distance, unite_maxima
 from rayfix_service.fusion.posterior.voxels import is_free_position, nearest_free
 from rayfix_tables.gaussians.cholesky import cholesky, invert, solve
 
 _SAME_MODE = 9.0
 """Two maxima nearer than this, squared and in what either is uncertain by, count as one mode."""
+
+_VALLEY = float(np.log(2.0))
+"""Two maxima are of one mode unless the density between them falls to less than half of the lower one, nats.
+
+Two equal Gaussians are two modes from 3.3 of their standard deviations on, nearer ones have too little between them.
+"""
+
+_FARTHEST = 64.0
+"""Maxima farther apart than this, squared and in what either is uncertain by, are not compared."""
 
 
 class _Gaussians(NamedTuple):
@@ -81,7 +91,7 @@ def _modes(gaussians: Any, which: Any, total: Any, origin: Any, voxel_size: Any,
     """Find the modes of Gaussians that are ``which`` of a ``total``; those left out count as the first mode's."""
     log_density, weight, mean, cov, precision = gaussians
     count = len(weight)
-    top, member = gather(log_density, mean, precision, _SAME_MODE, stop)
+    top, member = gather(log_density, mean, precision, _SAME_MODE, _VALLEY, _FARTHEST, stop)
     probability, position = np.zeros(len(top)), np.zeros((len(top), 3))
     for h in range(count):
         probability[member[h]] += weight[h]
@@ -122,7 +132,7 @@ def _second_moments(weight: Any, mean: Any, cov: Any, member: Any, total: Any, p
 
 
 @numba.njit(cache=True, nogil=True)
-def gather(log_density: Any, mean: Any, precision: Any, same_mode: Any, stop: Any) -> Any:
+def gather(log_density: Any, mean: Any, precision: Any, same_mode: Any, valley: Any, farthest: Any, stop: Any) -> Any:
     """Climb from each hypothesis, the densest first, and group the hypotheses by the mode they come to.
 
     Parameters
@@ -134,13 +144,15 @@ def gather(log_density: Any, mean: Any, precision: Any, same_mode: Any, stop: An
     same_mode : float
         Two maxima are one mode when their squared distance is below this in what either is
         uncertain by.
+    valley, farthest : float
+        As ``depth`` and ``reach`` of :func:`~rayfix_service.fusion.posterior.saddles.unite_maxima`.
     stop : ndarray of uint8, shape (1,)
         As in :class:`~rayfix_service.fusion.stopping.Stop`; once it is set, those that are left go to the first mode.
 
     Returns
     -------
     top : ndarray of shape (m, 3), m
-        Maximum of each mode, in the order in which they were found.
+        Highest maximum of each mode, in the order in which they were found.
     member : ndarray of int64, shape (h,)
         Mode of each hypothesis.
     """
@@ -156,7 +168,7 @@ def gather(log_density: Any, mean: Any, precision: Any, same_mode: Any, stop: An
         for n in range(found):
             if known >= 0:
                 break
-            if min(_square(mode, top[n], curvature[n]), _square(mode, top[n], here)) < same_mode:
+            if min(squared_distance(mode, top[n], curvature[n]), squared_distance(mode, top[n], here)) < same_mode:
                 known = n
         if known < 0:
             known = found
@@ -164,15 +176,12 @@ def gather(log_density: Any, mean: Any, precision: Any, same_mode: Any, stop: An
             curvature[found] = here
             found += 1
         member[h] = known
-    return top[:found].copy(), member
-
-
-@numba.njit(cache=True, nogil=True)
-def _square(x: Any, y: Any, precision: Any) -> Any:
-    """Square of the Mahalanobis distance."""
-    a, b, c = x[0] - y[0], x[1] - y[1], x[2] - y[2]
-    straight = a * a * precision[0, 0] + b * b * precision[1, 1] + c * c * precision[2, 2]
-    return straight + 2.0 * (a * b * precision[1, 0] + a * c * precision[2, 0] + b * c * precision[2, 1])
+    first = unite_maxima(log_density, mean, precision, top[:found], curvature[:found], valley, farthest, stop)
+    number, kept = np.empty(found, np.int64), np.flatnonzero(first == np.arange(found))
+    number[kept] = np.arange(len(kept))
+    for h in range(count):
+        member[h] = number[first[member[h]]]
+    return top[kept], member
 
 
 @numba.njit(cache=True, nogil=True)
@@ -208,11 +217,11 @@ def climb(log_density: Any, mean: Any, precision: Any, start: Any, top: Any, cur
     for _ in range(500):
         for n in range(len(top)):
             # A hundredth: within a tenth of its standard deviation only the mode itself attracts.
-            if _square(x, top[n], curvature[n]) < 0.01:
+            if squared_distance(x, top[n], curvature[n]) < 0.01:
                 return x, matrix, n
         highest = -np.inf
         for h in range(count):
-            logs[h] = log_density[h] - 0.5 * _square(x, mean[h], precision[h])
+            logs[h] = log_density[h] - 0.5 * squared_distance(x, mean[h], precision[h])
             highest = max(highest, logs[h])
         total = 0.0
         xx, yx, yy, zx, zy, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

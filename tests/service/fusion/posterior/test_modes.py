@@ -162,7 +162,7 @@ def test_gathering_equals_climbing_all_the_way_from_each(seed: int) -> None:
     weight, mean, cov = random_mixture(seed, 40)
     precision = np.asarray(np.linalg.inv(cov), np.float64)
     log_peak = np.log(weight) + 0.5 * np.linalg.slogdet(precision)[1]
-    _, member = modes.gather(log_peak, mean, precision, 9.0, NEVER.cell)
+    _, member = modes.gather(log_peak, mean, precision, 9.0, -np.inf, 0.0, NEVER.cell)
     tops: list[tuple[Array, Array]] = []
     expected = np.full(40, -1)
     for h in np.argsort(-log_peak):
