@@ -22,8 +22,8 @@ from rich.progress import (
 from rich.table import Table as Grid
 from rich.text import Text
 
+from rayfix_tables.part import Update
 from rayfix_tables.table import Table
-from rayfix_tables.update import Update
 
 if TYPE_CHECKING:
     from rayfix_offline.build import BuildSummary

@@ -25,34 +25,11 @@ from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import UNBALANCED, Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+from rayfix_tables.part import StationPart, Update
+from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
-from rayfix_tables.update import Update
 
 Attributes = Mapping[str, Mapping[str, Any]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class StationPart:
-    """A station's part of the table; see :class:`rayfix_tables.write.StationContent`."""
-
-    station: Station
-    levels: tuple[Level, ...]
-    lost_ray_share: float
-    coverage: tuple[float, ...]
-    part_id: str = ""
-    update: Update | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scene:
-    """The mesh that the table was built from, and its free space."""
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    face_materials: NDArray[np.int16]
-    materials: tuple[str, ...]
-    free_space: FreeSpace
-    sha256: str
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,8 @@ from rayfix_offline.site import SiteFile, parse_site
 from rayfix_offline.twin.twin import Twin, prepare_scene
 from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import SiteError, TableError
-from rayfix_tables.table import StationPart, Table
+from rayfix_tables.part import StationPart
+from rayfix_tables.table import Table
 
 
 @dataclass(frozen=True, kw_only=True)

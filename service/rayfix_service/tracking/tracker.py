@@ -21,7 +21,7 @@ from rayfix_service.tracking.settings import TrackingSettings
 from rayfix_service.tracking.track import TrackedPosition, TrackState
 from rayfix_service.tracking.walls import walls_of
 from rayfix_tables.errors import ReportError
-from rayfix_tables.table import Scene
+from rayfix_tables.scene import Scene
 
 _MOST_HYPOTHESES = 512
 """Of a report, the best are taken in: each meets all particles, and few reports have a quarter as many."""

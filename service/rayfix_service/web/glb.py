@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.table import Scene
+from rayfix_tables.scene import Scene
 
 MEDIA_TYPE = "model/gltf-binary"
 

@@ -9,7 +9,7 @@ from rayfix_service.fusion.lookup.lookup import look_up
 from rayfix_service.fusion.measurements.directions import Direction, in_field_of_view
 from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_tables.level import Level
-from rayfix_tables.table import StationPart
+from rayfix_tables.part import StationPart
 
 
 @dataclass(frozen=True, kw_only=True)

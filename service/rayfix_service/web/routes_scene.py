@@ -21,7 +21,8 @@ from rayfix_service.http.routes.dependencies import ServicesDep, TableDep
 from rayfix_service.web.documents import CoverageDocument, MixtureDocument, mixture_document
 from rayfix_service.web.glb import MEDIA_TYPE, write_glb
 from rayfix_service.web.inspector import mass_by_reflections, view_direction
-from rayfix_tables.table import StationPart, Table
+from rayfix_tables.part import StationPart
+from rayfix_tables.table import Table
 
 router = APIRouter(prefix="/v1", tags=["viewer"])
 

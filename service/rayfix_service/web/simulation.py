@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from rayfix_tables.angles import wrap
 from rayfix_tables.errors import ReportError
 from rayfix_tables.mixture import joint_cov
-from rayfix_tables.table import StationPart, Table
+from rayfix_tables.part import StationPart
+from rayfix_tables.table import Table
 
 Kind = Literal["aoa", "pt", "toa", "tdoa"]
 

@@ -24,7 +24,8 @@ from rayfix_service.wire import FixDocument, parse_report
 from rayfix_tables.errors import ReportError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.mixture import TubeMixture
-from rayfix_tables.table import Scene, Table
+from rayfix_tables.scene import Scene
+from rayfix_tables.table import Table
 from tests.support.running_app import RunningApp
 
 DEGREE = math.pi / 180.0
