@@ -23,6 +23,8 @@ from rayfix_tables.disk.schema import (
     content_id,
     dataset_paths,
     level_path,
+    read_text,
+    write_text,
 )
 from rayfix_tables.errors import RayfixError, TableError
 from rayfix_tables.level import Level
@@ -30,6 +32,9 @@ from rayfix_tables.mixture import FIELD_SHAPES
 from rayfix_tables.part import StationPart, Update
 from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo
+
+_LIBVER = ("v108", "v108")
+"""Of HDF5's own structures: those since 1.8 have checksums, so that a damaged one is found and not followed."""
 
 
 def check_folder(path: Path, error: type[RayfixError]) -> None:
@@ -95,7 +100,7 @@ def write_table(
         partial, descriptor = own_file(path.parent, f".{path.name}.partial-")
         with _Sink(descriptor, "w+") as sink:
             try:
-                with h5py.File(sink, "w", alignment_threshold=1, alignment_interval=64) as file:
+                with h5py.File(sink, "w", libver=_LIBVER, alignment_threshold=1, alignment_interval=64) as file:
                     table_id = _write_content(file, site, scene, parts, software_version)
             finally:
                 sink.raise_failure()
@@ -159,29 +164,28 @@ def _write_content(
     parts: Sequence[StationPart],
     software_version: str,
 ) -> str:
+    _write_json(file, "site", _site_document(site))
     _write_scene(file, scene)
     for part in parts:
-        _write_part(file, part)
-    file.attrs["format"] = FORMAT
+        _write_part(file, part, scene.origin)
     file.attrs["format_version"] = FORMAT_VERSION
-    file.attrs["software_version"] = software_version
-    file.attrs["scene_sha256"] = scene.sha256
-    file.attrs["site"] = json.dumps(_site_document(site), sort_keys=True)
-    digests = {name: str(file[name].attrs["sha256"]) for name in dataset_paths(file)}
+    for name, text in (("format", FORMAT), ("software_version", software_version), ("scene_sha256", scene.sha256)):
+        write_text(file, name, text)
+    digests = {name: read_text(file[name], "sha256") for name in dataset_paths(file)}
     table_id = content_id(content_attributes(file), digests)
-    file.attrs["table_id"] = table_id
+    write_text(file, "table_id", table_id)
     return table_id
 
 
-def _write_part(file: h5py.File, part: StationPart) -> None:
+def _write_part(file: h5py.File, part: StationPart, origin: NDArray[np.float64]) -> None:
     station = part.station
     group = file.create_group(f"stations/{station.id}")
-    group.attrs["position_m"] = np.asarray(station.position)
+    group.attrs["position_m"] = np.asarray(station.position) - origin
     group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
     group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
     for name, value in bias_attributes(station.bias).items():
         group.attrs[name] = value
-    group.attrs["part_id"] = part.part_id
+    write_text(group, "part_id", part.part_id)
     group.attrs["lost_ray_share"] = part.lost_ray_share
     group.attrs["coverage"] = np.asarray(part.coverage)
     for n, level in enumerate(part.levels):
@@ -192,7 +196,10 @@ def _write_part(file: h5py.File, part: StationPart) -> None:
 
 def _write_scene(file: h5py.File, scene: Scene) -> None:
     group = file.create_group("scene")
-    group.attrs["materials"] = json.dumps(scene.materials)
+    if scene.origin.any():
+        group.attrs["origin_m"] = scene.origin
+        scene = scene.in_table_frame
+    _write_json(group, "materials", scene.materials)
     _write(group, "vertices_m", scene.vertices.astype(np.float64))
     _write(group, "faces", scene.faces.astype(np.int32))
     _write(group, "face_materials", scene.face_materials.astype(np.int16))
@@ -214,16 +221,20 @@ def _write_level(group: h5py.Group, level: Level) -> None:
 
 
 def _write_update(group: h5py.Group, update: Update) -> None:
-    group.attrs["exact_part_id"] = update.exact_part_id
-    group.attrs["former_part_id"] = update.former_part_id
+    write_text(group, "exact_part_id", update.exact_part_id)
+    write_text(group, "former_part_id", update.former_part_id)
     group.attrs["update_tolerance"] = update.tolerance
     for n, change in enumerate(update.cell_change):
         _write(group[f"levels/{n}"], "cell_change", change.astype(np.float32))
 
 
+def _write_json(group: h5py.Group, name: str, document: Any) -> None:
+    _write(group, name, np.frombuffer(json.dumps(document, sort_keys=True).encode(), np.uint8))
+
+
 def _write(group: h5py.Group, name: str, array: NDArray[Any]) -> h5py.Dataset:
     dataset = group.create_dataset(name, data=array)
-    dataset.attrs["sha256"] = array_digest(array)
+    write_text(dataset, "sha256", array_digest(array))
     return dataset
 
 

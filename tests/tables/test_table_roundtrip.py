@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rayfix_tables.disk.schema import FORMAT_VERSION, array_digest
+from rayfix_tables.disk.schema import FORMAT_VERSION, array_digest, read_text
 from rayfix_tables.errors import CorruptTableError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
@@ -161,6 +161,51 @@ def test_a_table_written_before_there_were_biases_has_none(small_table_path: Pat
     assert all(station.bias == NO_BIAS for station in Table.open(path).site.stations)
 
 
+def test_a_table_of_format_1_is_still_read(make_content: Callable[..., Any]) -> None:
+    """Its texts are attributes of variable length."""
+    path = Path(__file__).parent / "stored" / "format-1.h5"
+    table = Table.open(path)
+    assert_same_table(table, make_content(1, num_stations=1, num_levels=1))
+    assert table.format_version == 1
+    assert table.table_id == "4506b08f92814eda2c4c9d246dbb340c18f557041afaf38eb6bdc473c134eea3"
+    table.verify()
+
+
+def far_content(make_content: Callable[..., Any]) -> Any:
+    """Content whose scene and stations lie at whole metres far away; components count from there."""
+    content = make_content(7)
+    origin = np.array([448254.0, 5412335.0, 0.0])
+    stations = tuple(
+        replace(s, position=tuple((np.round(s.position, 3) + origin).tolist())) for s in content.site.stations
+    )
+    parts = tuple(replace(p, station=s) for p, s in zip(content.parts, stations, strict=True))
+    scene = replace(content.scene, vertices=np.round(content.scene.vertices, 3)).moved(origin)
+    return replace(content, site=replace(content.site, stations=stations), scene=scene, parts=parts)
+
+
+def test_a_scene_on_map_coordinates_comes_back_to_the_last_bit(
+    make_content: Callable[..., Any], tmp_path: Path
+) -> None:
+    content = far_content(make_content)
+    content.write(tmp_path / "t.h5")
+    table = Table.open(tmp_path / "t.h5")
+    assert_same_table(table, content)
+    assert_same_bits(table.scene.origin, content.scene.origin)
+    table.verify()
+    with h5py.File(tmp_path / "t.h5") as file:
+        assert np.abs(file["scene/vertices_m"][()]).max() < 10.0
+        assert np.abs(file["stations/bs0"].attrs["position_m"]).max() < 10.0
+        assert np.abs(file["scene/free_space"].attrs["origin_m"]).max() < 10.0
+
+
+def test_near_the_origin_nothing_is_said_of_it(small_table_path: Path) -> None:
+    with h5py.File(small_table_path) as file:
+        assert "origin_m" not in file["scene"].attrs
+    table = Table.open(small_table_path)
+    assert table.scene.in_table_frame is table.scene
+    assert not table.scene.origin.any()
+
+
 def test_arrays_are_mapped_and_cannot_be_written(small_table_path: Path) -> None:
     """A view of the file itself, 64-byte aligned; nothing of it is read in advance."""
     table = Table.open(small_table_path)
@@ -180,9 +225,9 @@ def test_arrays_are_mapped_and_cannot_be_written(small_table_path: Path) -> None
 def test_the_site_is_plain_json(small_table_path: Path, make_content: Callable[..., Any]) -> None:
     """Other programs can read it."""
     with h5py.File(small_table_path) as file:
-        assert file.attrs["format"] == "rayfix-table"
+        assert read_text(file, "format") == "rayfix-table"
         assert file.attrs["format_version"] == FORMAT_VERSION
-        document = json.loads(file.attrs["site"])
+        document = json.loads(file["site"][()].tobytes())
     site = make_content(1).site
     assert document["station_ids"] == ["bs0", "bs1"]
     assert document["north_deg"] == pytest.approx(np.rad2deg(site.north), rel=DEGREES)
@@ -306,7 +351,7 @@ def test_an_update_is_part_of_the_table(make_content: Callable[..., Any], tmp_pa
     assert_same_table(table, updated)
     first, second = table.parts.values()
     assert second.update is None
-    expected = updated.stations[0].update
+    expected = updated.parts[0].update
     for ours, theirs in zip(first.update.cell_change, expected.cell_change, strict=True):
         assert_same_bits(ours, theirs)
     assert replace(first.update, cell_change=()) == replace(expected, cell_change=())
