@@ -136,7 +136,7 @@ def build_table(
     method = Method()
     twin = prepare_twin(site, site_path.parent, method.twin)
     refuse_errors(twin)
-    plans = plan_build(site, twin, method)
+    plans = plan_build(twin.site, twin, method)
     refused: list[str] = []
     former_table = read_former(
         Path(former) if former is not None else table_path,
@@ -145,12 +145,16 @@ def build_table(
         refused=refused.append,
     )
     with closing(ShardStore.beside(table_path)) as store:
-        job = Job(site=site, twin=twin, method=method, store=store, jobs=jobs, former=former_table, tolerance=tolerance)
+        job = Job(
+            site=twin.site, twin=twin, method=method, store=store, jobs=jobs, former=former_table, tolerance=tolerance
+        )
         total = sum(plan.num_cells for plan in plans)
         built = _build_stations(plans, job, cluster, report)
         report("balancing", total, total)
         built = _balanced(built, job)
-        parts = [station.part for station in built]
+        parts = [
+            replace(station.part, station=given) for station, given in zip(built, site.info().stations, strict=True)
+        ]
         if not any(len(level.mixture) for part in parts for level in part.levels):
             raise BuildError("no ray of any station finds free space; check the stations' positions and fields of view")
         report("writing", total, total)
@@ -262,7 +266,7 @@ def _scene_of(twin: Twin) -> Scene:
         materials=twin.scene.materials,
         free_space=twin.free_space,
         sha256=twin.scene.sha256,
-    )
+    ).moved(twin.origin)
 
 
 def _summary(station_id: str, built: BuiltStation) -> StationSummary:

@@ -42,6 +42,11 @@ class Scene:
         return replace(self, vertices=self.vertices + by, free_space=self.free_space.moved(by), origin=self.origin + by)
 
     @cached_property
+    def free_space_in_table_frame(self) -> FreeSpace:
+        """The free space in the table's frame."""
+        return self.free_space.moved(-self.origin)
+
+    @cached_property
     def in_table_frame(self) -> "Scene":
         """The same scene in the table's frame, in which components have their positions."""
         return self.moved(-self.origin)

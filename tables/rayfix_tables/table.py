@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -106,11 +107,11 @@ class Table:
             attributes = layout.attributes[f"stations/{station_id}"]
             station = Station(
                 id=station_id,
-                position=_moved(_triple(attributes["position_m"]), scene.origin),
+                position=_triple(attributes["position_m"]),
                 orientation=_radians(_triple(attributes["orientation_deg"])),
                 field_of_view=float(np.deg2rad(_finite(attributes["field_of_view_deg"]))),
                 bias=read_bias(attributes),
-            )
+            ).moved(scene.origin)
             levels = tuple(_read_level(path, layout, mapped) for path in _level_paths(layout, station_id))
             stations.append(station)
             parts[station_id] = StationPart(
@@ -137,6 +138,19 @@ class Table:
             parts=parts,
             layout=layout,
             mapped=mapped,
+        )
+
+    @cached_property
+    def in_table_frame(self) -> "Table":
+        """The same table with its scene and stations in the frame of its components: fixes are in that frame, too."""
+        if not self.scene.origin.any():
+            return self
+        stations = tuple(station.moved(-self.scene.origin) for station in self.site.stations)
+        return replace(
+            self,
+            site=replace(self.site, stations=stations),
+            scene=self.scene.in_table_frame,
+            parts={station.id: replace(self.parts[station.id], station=station) for station in stations},
         )
 
     def levels(self, station_id: str) -> tuple[Level, ...]:
@@ -318,8 +332,3 @@ def _object(value: Any) -> dict[str, Any]:
 def _radians(degrees: tuple[float, float, float]) -> tuple[float, float, float]:
     a, b, c = np.deg2rad(degrees).tolist()
     return (a, b, c)
-
-
-def _moved(position: tuple[float, float, float], by: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = (np.asarray(position) + by).tolist()
-    return (x, y, z)

@@ -38,6 +38,9 @@ _FEWER_HYPOTHESES = (
 class Locator:
     """Answers reports from a table.
 
+    Positions that go in and come out are in the scene's frame. In between they are in the table's, which is the same
+    but for scenes on map coordinates.
+
     Parameters
     ----------
     table : Table
@@ -94,7 +97,9 @@ class Locator:
             As of :meth:`locate`, and so are the errors.
         """
         product = self._product(report, stop)
-        return make_posterior(product.hypotheses, product.prior, self.table.scene.free_space, stop)
+        scene = self.table.scene
+        posterior = make_posterior(product.hypotheses, product.prior, scene.free_space_in_table_frame, stop)
+        return posterior.moved(scene.origin)
 
     def seconds(self, report: Report) -> float:
         """Estimate how long a fix of a report will take, s, within some microseconds.
@@ -121,8 +126,10 @@ class Locator:
     def _product(self, report: Report, stop: Stop) -> Product:
         """Multiply what the measurements say."""
         sorted_report = sort_report(report, self.table.site)
-        free_space = self.table.scene.free_space
-        prior = self._uniform_prior if report.height is None else height_prior(report.height, free_space)
+        prior = self._uniform_prior
+        if report.height is not None:
+            scene = self.table.scene
+            prior = height_prior(report.height, scene.free_space).raised(-float(scene.origin[2]))
         unused = dict(sorted_report.unused)
         observations, factors = self._factors(sorted_report, prior, unused, stop)
         hypotheses = None
@@ -190,7 +197,8 @@ class Fused:
     ----------
     fix : Fix
     hypotheses : Hypotheses or None
-        Of the position, not yet cut to the free space; None where no measurement could be used.
+        Of the position, not yet cut to the free space; None where no measurement could be used. In the table's frame,
+        as the prior.
     prior : Prior
         Of the position, with which the hypotheses' Gaussians are multiplied.
     """

@@ -52,6 +52,8 @@ class _Track:
 class Tracker:
     """Follows targets through one building. It may be used from several threads.
 
+    Particles are in the table's frame, as hypotheses are; the positions that it gives are in the scene's.
+
     Parameters
     ----------
     scene : Scene
@@ -65,7 +67,8 @@ class Tracker:
         self, scene: Scene, settings: TrackingSettings | None = None, *, clock: Callable[[], float] = monotonic
     ) -> None:
         self.settings = settings or TrackingSettings()
-        self._walls = walls_of(scene)
+        self._walls = walls_of(scene.in_table_frame)
+        self._origin = scene.origin
         self._clock = clock
         self._tracks: OrderedDict[str, _Track] = OrderedDict()  # the one heard of last comes last
         self._lock = Lock()
@@ -141,7 +144,7 @@ class Tracker:
         particles = self._newborn(fused, rng)
         if particles is None:
             return None
-        position = _told(state, timestamp, 1, particles)
+        position = _told(state, timestamp, 1, particles).moved(self._origin)
         return _Track(particles=particles, position=position, seconds=seconds, touched=now, rng=rng)
 
     def _newborn(self, fused: Fused, rng: np.random.Generator) -> Particles | None:
@@ -166,7 +169,7 @@ class Tracker:
         if particles is None:
             return None
         told = 1 if state == "restarted" else track.position.num_reports + (state == "updated")
-        position = _told(state, timestamp, told, particles)
+        position = _told(state, timestamp, told, particles).moved(self._origin)
         return _Track(particles=particles, position=position, seconds=track.seconds + gap, touched=now, rng=rng)
 
     def _take_in(

@@ -55,6 +55,7 @@ def find_path(part: StationPart, place: NDArray[np.float64]) -> SimulatedPath | 
     ----------
     part : StationPart
     place : ndarray of shape (3,), m
+        In the table's frame.
     """
     level = part.levels[0]
     mixture = level.mixture
@@ -126,7 +127,8 @@ def simulate(
             f"position ({x:.2f}, {y:.2f}, {z:.2f}) is in a solid or outside; give one in the free space",
             path=("position",),
         )
-    paths = [path for part in table.parts.values() if (path := find_path(part, point)) is not None]
+    local = point - table.scene.origin
+    paths = [path for part in table.parts.values() if (path := find_path(part, local)) is not None]
     if not paths:
         raise ReportError(
             f"no station hears position ({x:.2f}, {y:.2f}, {z:.2f}); give one that rays reach", path=("position",)
