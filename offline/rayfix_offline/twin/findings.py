@@ -12,10 +12,14 @@ from rayfix_offline.scene.scene import METRES_PER_UNIT, Scene
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin.cleaning import Duplicates
 from rayfix_offline.twin.enclosures import Enclosures
+from rayfix_offline.twin.partitions import THICKNESS, Partitions
 from rayfix_offline.twin.solids import Part, touched
 
 LARGE_SCENE, SMALL_SCENE = 1000.0, 1.0
 """A scene larger or smaller than this probably has another unit, m."""
+
+OPAQUE_ABOVE = 10.0
+"""Carrier frequency from which on thin partitions take much of a signal, GHz."""
 
 MOST_NAMES = 4
 
@@ -161,6 +165,20 @@ def material_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
             f"material{'s' if len(unknown) > 1 else ''} {_listed(unknown)} unknown: reflection_loss_db is taken",
             f"ITU-R P.2040 has {', '.join(ITU_MATERIALS)}",
         )
+
+
+def partition_findings(site: SiteFile, scene: Scene, partitions: Partitions) -> Iterator[Finding]:
+    """Tell of thin walls, which are opaque here and not to signals of low frequencies."""
+    if site.propagation.carrier_ghz >= OPAQUE_ABOVE or not partitions.faces.any():
+        return
+    walls = [scene.objects[n] for n in np.unique(scene.face_objects[partitions.faces])]
+    yield warning(
+        "thin partition",
+        f"walls thinner than {THICKNESS:g} m, not known to be of concrete, brick or metal, divide the free space into "
+        f"{partitions.rooms} rooms: {_listed(walls)}; at {site.propagation.carrier_ghz:g} GHz signals pass thin "
+        "partitions, but rays pass no wall",
+        "leave thin partitions and doors out of the mesh, and name the material of walls of concrete, brick or metal",
+    )
 
 
 def station_findings(

@@ -17,10 +17,12 @@ from rayfix_offline.twin.findings import (
     file_findings,
     material_findings,
     mesh_findings,
+    partition_findings,
     size_findings,
     station_findings,
 )
 from rayfix_offline.twin.mesh import Mesh
+from rayfix_offline.twin.partitions import find_partitions
 from rayfix_offline.twin.planes import Planes, merge_coplanar
 from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.solids import map_free_space, sealed_space, split_parts
@@ -98,6 +100,7 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
         *file_findings(scene),
         *mesh_findings(scene, duplicates, [part.moved(origin) for part in parts], enclosures),
         *material_findings(site, scene),
+        *partition_findings(site, scene, find_partitions(scene, free_space, closed=closed)),
         *station_findings(site, scene, parts, enclosures, touch=settings.touch, origin=origin),
     ]
     if not free_space.free.any():
