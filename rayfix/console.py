@@ -22,8 +22,8 @@ from rich.progress import (
 from rich.table import Table as Grid
 from rich.text import Text
 
+from rayfix_tables.part import Update
 from rayfix_tables.table import Table
-from rayfix_tables.update import Update
 
 if TYPE_CHECKING:
     from rayfix_offline.build import BuildSummary
@@ -232,6 +232,7 @@ def table_info(table: Table) -> dict[str, Any]:
         "bytes": table.path.stat().st_size,
         "faces": len(table.scene.faces),
         "free_space_m3": round(table.scene.free_space.volume, 3),
+        "origin_m": table.scene.origin.tolist(),
         "stations": [
             {
                 "id": station_id,
@@ -277,6 +278,9 @@ def print_table_info(table: Table) -> None:
         f"scene of {facts['faces']:,} triangles, {facts['free_space_m3']:,.0f} m3 of free space",
     ):
         console.print(line, highlight=False, soft_wrap=True)
+    if any(facts["origin_m"]):
+        origin = ", ".join(f"{v:.0f}" for v in facts["origin_m"])
+        console.print(f"the table's own coordinates count from ({origin}) m", highlight=False, soft_wrap=True)
     grid = Grid("station", "position, m", box=box.SIMPLE_HEAD)
     for heading in ("window, deg", "cells", "components"):
         grid.add_column(heading, justify="right")
@@ -284,7 +288,7 @@ def print_table_info(table: Table) -> None:
         for n, level in enumerate(station["levels"]):
             grid.add_row(
                 station["id"] if n == 0 else "",
-                ", ".join(f"{v:g}" for v in station["position_m"]) if n == 0 else "",
+                ", ".join(f"{round(v, 6):.10g}" for v in station["position_m"]) if n == 0 else "",
                 f"{level['window_deg']:g}",
                 f"{level['cells']:,}",
                 f"{level['components']:,}",

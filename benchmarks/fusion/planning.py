@@ -44,7 +44,7 @@ def compare_paths(table: Table, height: float, spacing: float, seed: int) -> Non
     solver = solver_of(table)
     right, strongest, some, off, apart = [], [], [], [], []
     for station in table.site.stations:
-        predicted = audible_paths(table.levels(station.id)[0], places)
+        predicted = audible_paths(table.levels(station.id)[0], places - table.scene.origin)
         of_station = solver.station(station.position)
         for n, place in enumerate(places):
             paths = of_station.paths(place)

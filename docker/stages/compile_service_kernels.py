@@ -16,9 +16,11 @@ from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture, pack
+from rayfix_tables.part import StationPart
+from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.version import software_version
-from rayfix_tables.write import SceneContent, StationContent, write_table
+from rayfix_tables.write import write_table
 
 ROOM = np.array([6.0, 8.0, 3.0])
 WINDOWS = np.deg2rad([2.5, 10.0])
@@ -42,7 +44,7 @@ def write_room(path: Path) -> None:
     write_table(
         path,
         site=SiteInfo(name="room", north=0.0, max_path_length=20.0, stations=stations, document={}),
-        scene=SceneContent(
+        scene=Scene(
             vertices=np.array([low, ROOM, [ROOM[0], 0.0, 0.0]]),
             faces=np.array([[0, 1, 2]], np.int32),
             face_materials=np.array([-1], np.int16),
@@ -50,8 +52,8 @@ def write_room(path: Path) -> None:
             free_space=FreeSpace(origin=low, voxel_size=0.1, free=np.ones((ROOM / 0.1).round().astype(int), bool)),
             sha256="0" * 64,
         ),
-        stations=[
-            StationContent(levels=levels(np.array(station.position)), lost_ray_share=0.0, coverage=(1.0,))
+        parts=[
+            StationPart(station=station, levels=levels(np.array(station.position)), lost_ray_share=0.0, coverage=(1.0,))
             for station in stations
         ],
         software_version=software_version(),

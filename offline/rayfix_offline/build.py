@@ -26,8 +26,10 @@ from rayfix_offline.rays.lost_rays import LOST_RAYS_WARNING
 from rayfix_offline.site import read_site
 from rayfix_offline.twin.twin import Twin, prepare_twin, refuse_errors
 from rayfix_tables.errors import BuildError
+from rayfix_tables.part import StationPart
+from rayfix_tables.scene import Scene
 from rayfix_tables.version import software_version
-from rayfix_tables.write import SceneContent, StationContent, check_writable, write_table
+from rayfix_tables.write import check_writable, write_table
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, the number of cells that are done and their total number (0 while it is unknown)."""
@@ -134,7 +136,7 @@ def build_table(
     method = Method()
     twin = prepare_twin(site, site_path.parent, method.twin)
     refuse_errors(twin)
-    plans = plan_build(site, twin, method)
+    plans = plan_build(twin.site, twin, method)
     refused: list[str] = []
     former_table = read_former(
         Path(former) if former is not None else table_path,
@@ -143,20 +145,24 @@ def build_table(
         refused=refused.append,
     )
     with closing(ShardStore.beside(table_path)) as store:
-        job = Job(site=site, twin=twin, method=method, store=store, jobs=jobs, former=former_table, tolerance=tolerance)
+        job = Job(
+            site=twin.site, twin=twin, method=method, store=store, jobs=jobs, former=former_table, tolerance=tolerance
+        )
         total = sum(plan.num_cells for plan in plans)
         built = _build_stations(plans, job, cluster, report)
         report("balancing", total, total)
         built = _balanced(built, job)
-        contents = [station.content for station in built]
-        if not any(len(level.mixture) for content in contents for level in content.levels):
+        parts = [
+            replace(station.part, station=given) for station, given in zip(built, site.info().stations, strict=True)
+        ]
+        if not any(len(level.mixture) for part in parts for level in part.levels):
             raise BuildError("no ray of any station finds free space; check the stations' positions and fields of view")
         report("writing", total, total)
         table_id = write_table(
             table_path,
             site=site.info(),
-            scene=_scene_content(twin),
-            stations=contents,
+            scene=_scene_of(twin),
+            parts=parts,
             software_version=software_version(),
         )
         store.remove()
@@ -171,7 +177,7 @@ def build_table(
         warnings=(
             *refused,
             *(finding.message for finding in twin.findings),
-            *_lost_ray_warnings(plans, contents, twin),
+            *_lost_ray_warnings(plans, parts, twin),
             *_dropped_warnings(stations),
         ),
     )
@@ -203,22 +209,20 @@ def _balanced(stations: list[BuiltStation], job: Job) -> list[BuiltStation]:
     """
     if job.site.propagation.path_prior != "power":
         return stations
-    levels = [level for station in stations if not _keeps_balance(station) for level in station.content.levels]
+    levels = [level for station in stations if not _keeps_balance(station) for level in station.part.levels]
     tasks = (delayed(balanced)(level, job.twin.free_space, job.method.balance) for level in levels)
     done = iter(Parallel(n_jobs=job.jobs, prefer="threads")(tasks))
     return [
         station
         if _keeps_balance(station)
-        else replace(
-            station, content=replace(station.content, levels=tuple(next(done) for _ in station.content.levels))
-        )
+        else replace(station, part=replace(station.part, levels=tuple(next(done) for _ in station.part.levels)))
         for station in stations
     ]
 
 
 def _keeps_balance(station: BuiltStation) -> bool:
     """Whether a station's part is taken from a former table that is normalised; those of early versions are not."""
-    levels = station.content.levels
+    levels = station.part.levels
     return station.origin == "kept" and all(len(level.log_balance) == len(level.mixture) for level in levels)
 
 
@@ -235,11 +239,11 @@ def _start_engine(cluster: str | None, job: Job) -> AbstractContextManager[Fitti
     return Cluster(cluster, job)
 
 
-def _lost_ray_warnings(plans: tuple[StationPlan, ...], contents: list[StationContent], twin: Twin) -> Iterator[str]:
-    for plan, content in zip(plans, contents, strict=True):
-        if twin.closed and content.lost_ray_share > LOST_RAYS_WARNING:
+def _lost_ray_warnings(plans: tuple[StationPlan, ...], parts: list[StationPart], twin: Twin) -> Iterator[str]:
+    for plan, part in zip(plans, parts, strict=True):
+        if twin.closed and part.lost_ray_share > LOST_RAYS_WARNING:
             yield (
-                f"{content.lost_ray_share:.1%} of the rays of station '{plan.station.id}' leave the closed scene; it "
+                f"{part.lost_ray_share:.1%} of the rays of station '{plan.station.id}' leave the closed scene; it "
                 "has holes: close them"
             )
 
@@ -254,32 +258,32 @@ def _dropped_warnings(stations: tuple[StationSummary, ...]) -> Iterator[str]:
             )
 
 
-def _scene_content(twin: Twin) -> SceneContent:
-    return SceneContent(
+def _scene_of(twin: Twin) -> Scene:
+    return Scene(
         vertices=twin.scene.vertices,
         faces=twin.scene.faces,
         face_materials=twin.scene.face_materials,
         materials=twin.scene.materials,
         free_space=twin.free_space,
         sha256=twin.scene.sha256,
-    )
+    ).moved(twin.origin)
 
 
 def _summary(station_id: str, built: BuiltStation) -> StationSummary:
-    content = built.content
+    part = built.part
     return StationSummary(
         station_id=station_id,
         origin=built.origin,
-        num_cells=sum(level.grid.num_cells for level in content.levels),
-        num_filled_cells=sum(int(np.isfinite(level.cell_log_mass).sum()) for level in content.levels),
-        num_finest_cells=content.levels[0].num_cells,
+        num_cells=sum(level.grid.num_cells for level in part.levels),
+        num_filled_cells=sum(int(np.isfinite(level.cell_log_mass).sum()) for level in part.levels),
+        num_finest_cells=part.levels[0].num_cells,
         num_kept_cells=built.num_kept_cells,
-        largest_change=content.update.largest_change if content.update else 0.0,
-        num_components=sum(len(level.mixture) for level in content.levels),
+        largest_change=part.update.largest_change if part.update else 0.0,
+        num_components=sum(len(level.mixture) for level in part.levels),
         num_dropped_components=built.num_dropped,
-        num_bytes=sum(level.num_bytes for level in content.levels),
-        lost_ray_share=content.lost_ray_share,
-        coverage=content.coverage,
+        num_bytes=sum(level.num_bytes for level in part.levels),
+        lost_ray_share=part.lost_ray_share,
+        coverage=part.coverage,
     )
 
 

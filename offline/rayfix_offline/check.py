@@ -81,8 +81,8 @@ def check_site(site_path: Path) -> Check:
     twin = prepare_twin(site, site_path.parent)
     misplaced = {finding.station_id for finding in twin.findings}
     escapes = tuple(
-        find_escapes(station, twin, max_reflections=site.propagation.max_reflections)
-        for station in site.stations
+        find_escapes(station, twin, max_reflections=site.propagation.max_reflections).moved(twin.origin)
+        for station in twin.site.stations
         if station.id not in misplaced
     )
     holes = (_hole(found, twin) for found in escapes if found.share > LOST_RAYS_WARNING)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from rayfix_tables.errors import SiteError
@@ -118,6 +119,16 @@ class SiteFile(_Section):
         if twice:
             raise ValueError(f"station ids must differ; more than one station is called {', '.join(twice)}")
         return self
+
+    def moved(self, by: NDArray[np.float64]) -> "SiteFile":
+        """Return the same site elsewhere, its stations moved by a vector of shape (3,), m."""
+        if not np.any(by):
+            return self
+        stations = tuple(
+            station.model_copy(update={"position_m": tuple((np.asarray(station.position_m) + by).tolist())})
+            for station in self.stations
+        )
+        return self.model_copy(update={"stations": stations})
 
     def info(self) -> SiteInfo:
         """Return the site as the table stores it."""

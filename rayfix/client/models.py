@@ -111,6 +111,7 @@ class TableAnswer:
     site_name: str
     north_deg: float
     max_path_length_m: float
+    origin_m: tuple[float, float, float]
     num_stations: int
     num_components: int
 
@@ -182,6 +183,7 @@ def table_answer(document: Mapping[str, Any]) -> TableAnswer:
         site_name=document["site"]["name"],
         north_deg=document["site"]["north_deg"],
         max_path_length_m=document["site"]["max_path_length_m"],
+        origin_m=_triple(document["origin_m"]),
         num_stations=document["num_stations"],
         num_components=document["num_components"],
     )
@@ -205,6 +207,11 @@ def _track(document: Mapping[str, Any]) -> TrackAnswer:
         horizontal_accuracy_m=float(document["horizontal_accuracy_m"]),
         vertical_accuracy_m=float(document["vertical_accuracy_m"]),
     )
+
+
+def _triple(values: Any) -> tuple[float, float, float]:
+    x, y, z = values
+    return (float(x), float(y), float(z))
 
 
 def _point(document: Mapping[str, Any]) -> Point:

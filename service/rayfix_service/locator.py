@@ -25,6 +25,9 @@ from rayfix_tables.table import Table
 class Locator:
     """Answers reports from a table.
 
+    Positions that go in and come out are in the scene's frame. In between they are in the table's, which is the same
+    but for scenes on map coordinates.
+
     Parameters
     ----------
     table : Table
@@ -113,7 +116,9 @@ class Locator:
             As of :meth:`locate`, and so are the errors.
         """
         product = self._fusion.product(_read(report), stop)
-        return make_posterior(product.hypotheses, product.prior, self.table.scene.free_space, stop)
+        scene = self.table.scene
+        posterior = make_posterior(product.hypotheses, product.prior, scene.free_space_in_table_frame, stop)
+        return posterior.moved(scene.origin)
 
     def seconds(self, report: Report) -> float:
         """Estimate how long a fix of a report will take, s, within some microseconds.

@@ -1,6 +1,6 @@
 """Where a UE can be at all: a voxel map of the building's free space."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,10 @@ class FreeSpace:
     def volume(self) -> float:
         """Volume of the free space, m3."""
         return float(np.count_nonzero(self.free)) * self.voxel_size**3
+
+    def moved(self, by: NDArray[np.float64]) -> "FreeSpace":
+        """Return the same map elsewhere, moved by a vector of shape (3,), m."""
+        return replace(self, origin=self.origin + by) if np.any(by) else self
 
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether points lie in free voxels.

@@ -1,9 +1,12 @@
 """What a table knows of its site: stations, north, and the settings it was built with."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +53,11 @@ class Station:
     orientation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     field_of_view: float = 6.283185307179586
     bias: StationBias = NO_BIAS
+
+    def moved(self, by: NDArray[np.float64]) -> "Station":
+        """Return the same station elsewhere, moved by a vector of shape (3,), m."""
+        x, y, z = (np.asarray(self.position) + by).tolist()
+        return replace(self, position=(x, y, z))
 
 
 @dataclass(frozen=True, kw_only=True)

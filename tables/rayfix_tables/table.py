@@ -1,8 +1,9 @@
 """Read table files. The arrays are mapped, not read: workers that serve one table share its pages."""
 
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,34 +26,9 @@ from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import UNBALANCED, Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+from rayfix_tables.part import StationPart, Update
+from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
-from rayfix_tables.update import Update
-
-Attributes = Mapping[str, Mapping[str, Any]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class StationPart:
-    """A station's part of the table; see :class:`rayfix_tables.write.StationContent`."""
-
-    station: Station
-    levels: tuple[Level, ...]
-    lost_ray_share: float
-    coverage: tuple[float, ...]
-    part_id: str = ""
-    update: Update | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scene:
-    """The mesh that the table was built from, and its free space."""
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    face_materials: NDArray[np.int16]
-    materials: tuple[str, ...]
-    free_space: FreeSpace
-    sha256: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +39,10 @@ class Table:
     ----------
     parts : dict of str to StationPart
         By station identifier, in the site's order.
-    attributes : mapping
-        Attributes of the file's objects, by path: with the arrays, what the ``table_id`` is made of.
+    layout : FileLayout
+        Of the file: with the arrays, what the ``table_id`` is made of.
+    mapped : ndarray of uint8
+        Bytes of the file.
     """
 
     path: Path
@@ -74,7 +52,8 @@ class Table:
     site: SiteInfo
     scene: Scene
     parts: dict[str, StationPart]
-    attributes: Attributes = field(default_factory=dict, repr=False, compare=False)
+    layout: FileLayout = field(default_factory=FileLayout, repr=False, compare=False)
+    mapped: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8), repr=False, compare=False)
 
     def __repr__(self) -> str:
         """Name the table; its arrays would fill the screen."""
@@ -112,11 +91,14 @@ class Table:
 
         Raises
         ------
-        LookupError, TypeError, ValueError
+        KeyError, ValueError
             When a part is missing or does not fit the others.
         """
         root = layout.attributes[""]
-        site_document = json.loads(_text(root["site"]))
+        site_document = _read_json(layout, mapped, "site")
+        if not isinstance(site_document, dict):
+            raise ValueError("site is no JSON object")
+        scene = _read_scene(layout, mapped)
         station_ids = site_document["station_ids"]
         _check_members(layout, station_ids)
         stations: list[Station] = []
@@ -126,35 +108,49 @@ class Table:
             station = Station(
                 id=station_id,
                 position=_triple(attributes["position_m"]),
-                orientation=_triple(np.deg2rad(attributes["orientation_deg"])),
-                field_of_view=float(np.deg2rad(attributes["field_of_view_deg"])),
+                orientation=_radians(_triple(attributes["orientation_deg"])),
+                field_of_view=float(np.deg2rad(_finite(attributes["field_of_view_deg"]))),
                 bias=read_bias(attributes),
-            )
+            ).moved(scene.origin)
             levels = tuple(_read_level(path, layout, mapped) for path in _level_paths(layout, station_id))
             stations.append(station)
             parts[station_id] = StationPart(
                 station=station,
                 levels=levels,
-                lost_ray_share=float(attributes["lost_ray_share"]),
-                coverage=tuple(float(share) for share in attributes["coverage"]),
+                lost_ray_share=_finite(attributes["lost_ray_share"]),
+                coverage=_row(attributes["coverage"]),
                 part_id=_text(attributes["part_id"]),
                 update=_read_update(station_id, layout, levels, mapped),
             )
         return cls(
             path=path,
             table_id=_text(root["table_id"]),
-            format_version=int(root["format_version"]),
+            format_version=int(_finite(root["format_version"])),
             software_version=_text(root["software_version"]),
             site=SiteInfo(
                 name=_text(site_document["name"]),
-                north=_finite(np.deg2rad(site_document["north_deg"])),
+                north=float(np.deg2rad(_finite(site_document["north_deg"]))),
                 max_path_length=_finite(site_document["max_path_length_m"]),
                 stations=tuple(stations),
-                document=site_document["document"],
+                document=_object(site_document["document"]),
             ),
-            scene=_read_scene(layout, mapped),
+            scene=scene,
             parts=parts,
-            attributes=layout.attributes,
+            layout=layout,
+            mapped=mapped,
+        )
+
+    @cached_property
+    def in_table_frame(self) -> "Table":
+        """The same table with its scene and stations in the frame of its components: fixes are in that frame, too."""
+        if not self.scene.origin.any():
+            return self
+        stations = tuple(station.moved(-self.scene.origin) for station in self.site.stations)
+        return replace(
+            self,
+            site=replace(self.site, stations=stations),
+            scene=self.scene.in_table_frame,
+            parts={station.id: replace(self.parts[station.id], station=station) for station in stations},
         )
 
     def levels(self, station_id: str) -> tuple[Level, ...]:
@@ -163,23 +159,8 @@ class Table:
 
     def arrays(self) -> Iterator[tuple[str, NDArray[Any]]]:
         """Arrays of the table as they are in the file, by the paths of their datasets."""
-        scene = self.scene
-        yield "scene/vertices_m", scene.vertices
-        yield "scene/faces", scene.faces
-        yield "scene/face_materials", scene.face_materials
-        yield "scene/free_space", scene.free_space.free.view(np.uint8)
-        for station_id, part in self.parts.items():
-            for n, level in enumerate(part.levels):
-                path = level_path(station_id, n)
-                yield f"{path}/ring_cells", level.grid.ring_cells
-                yield f"{path}/cell_offsets", level.cell_offsets
-                yield f"{path}/cell_log_mass", level.cell_log_mass
-                for name in FIELD_SHAPES:
-                    yield f"{path}/{name}", getattr(level.mixture, name)
-                if f"{path}/log_balance" in self.attributes:
-                    yield f"{path}/log_balance", level.log_balance
-                if part.update is not None:
-                    yield f"{path}/cell_change", part.update.cell_change[n]
+        for path in self.layout.datasets:
+            yield path, self.layout.array(path, self.mapped)
 
     def verify(self) -> None:
         """Read every byte and compare the checksums, in the file as it was opened.
@@ -193,16 +174,17 @@ class Table:
             digests: dict[str, str] = {}
             for name, array in self.arrays():
                 digests[name] = array_digest(array)
-                if digests[name] != self.attributes[name].get("sha256"):
+                if digests[name] != self.layout.attributes[name].get("sha256"):
                     raise ValueError(f"the checksum of {name} does not match")
-            if content_id(content_of(self.attributes), digests) != self.table_id:
+            if content_id(content_of(self.layout.attributes), digests) != self.table_id:
                 raise ValueError("the table_id does not match the content")
             check_finite(self.arrays())
 
 
 def _check_members(layout: FileLayout, station_ids: Any) -> None:
     """Check that the file has the stations that the site names, and no other group or dataset than theirs."""
-    if not isinstance(station_ids, list) or not station_ids or len(set(station_ids)) < len(station_ids):
+    named = isinstance(station_ids, list) and all(isinstance(each, str) for each in station_ids)
+    if not named or not station_ids or len(set(station_ids)) < len(station_ids):
         raise ValueError("station_ids are no list of different stations")
     known = {f"stations/{station_id}" for station_id in station_ids}
     for path in layout.attributes:
@@ -237,7 +219,7 @@ def _read_level(path: str, layout: FileLayout, mapped: NDArray[np.uint8]) -> Lev
         raise ValueError(f"{path}/log_balance has {len(log_balance)} entries, not {len(mixture)}")
     check_offsets(f"{path}/cell_offsets", offsets, len(mixture))
     return Level(
-        window=_positive(np.deg2rad(layout.attributes[path]["window_deg"]), f"window_deg of {path}"),
+        window=float(np.deg2rad(_positive(layout.attributes[path]["window_deg"], f"window_deg of {path}"))),
         grid=grid,
         cell_offsets=offsets,
         cell_log_mass=arrays["cell_log_mass"],
@@ -262,7 +244,7 @@ def _read_update(
     return Update(
         exact_part_id=_text(attributes["exact_part_id"]),
         former_part_id=_text(attributes["former_part_id"]),
-        tolerance=float(attributes["update_tolerance"]),
+        tolerance=_finite(attributes["update_tolerance"]),
         cell_change=changes,
     )
 
@@ -271,7 +253,7 @@ def _read_scene(layout: FileLayout, mapped: NDArray[np.uint8]) -> Scene:
     arrays = {name: layout.array(name, mapped) for name in SCENE_DATASETS}
     vertices, faces = arrays["scene/vertices_m"], arrays["scene/faces"]
     face_materials, free = arrays["scene/face_materials"], arrays["scene/free_space"]
-    materials = json.loads(_text(layout.attributes["scene"]["materials"]))
+    materials = _read_json(layout, mapped, "scene/materials")
     if not isinstance(materials, list):
         raise ValueError("materials are no list")
     for name, array in (("scene/vertices_m", vertices), ("scene/faces", faces)):
@@ -283,7 +265,8 @@ def _read_scene(layout: FileLayout, mapped: NDArray[np.uint8]) -> Scene:
     check_range("scene/face_materials", face_materials, -1, len(materials) - 1)
     check_range("scene/free_space", free, 0, 1)
     free_space = layout.attributes["scene/free_space"]
-    return Scene(
+    origin = np.array(_triple(layout.attributes["scene"].get("origin_m", (0.0, 0.0, 0.0))))
+    in_table_frame = Scene(
         vertices=vertices,
         faces=faces,
         face_materials=face_materials,
@@ -295,29 +278,57 @@ def _read_scene(layout: FileLayout, mapped: NDArray[np.uint8]) -> Scene:
         ),
         sha256=_text(layout.attributes[""]["scene_sha256"]),
     )
+    return in_table_frame.moved(origin)
+
+
+def _read_json(layout: FileLayout, mapped: NDArray[np.uint8], path: str) -> Any:
+    """Read what is a dataset of text, and was an attribute of the group above in version 1."""
+    if path in layout.datasets:
+        try:
+            return json.loads(layout.array(path, mapped).tobytes())
+        except ValueError as error:
+            raise ValueError(f"{path} is no JSON: {error}") from error
+    group, _, name = path.rpartition("/")
+    return json.loads(_text(layout.attributes[group][name]))
 
 
 def _text(value: Any) -> str:
     """Text that can be written into answers."""
     if not isinstance(value, str):
-        raise TypeError(f"{type(value).__name__} where there should be text")
+        raise ValueError(f"{type(value).__name__} where there should be text")
     value.encode("utf-8")
     return value
 
 
 def _finite(value: Any) -> float:
-    number = float(value)
-    if not np.isfinite(number):
-        raise ValueError(f"{number} where there should be a finite number")
-    return number
+    if not isinstance(value, int | float) or not np.isfinite(float(value)):
+        raise ValueError(f"{str(value)[:40]} where there should be a finite number")
+    return float(value)
 
 
 def _positive(value: Any, name: str) -> float:
-    if not 0.0 < (number := float(value)) < np.inf:
+    if not (number := _finite(value)) > 0.0:
         raise ValueError(f"{name} is {number}")
     return number
 
 
 def _triple(values: Any) -> tuple[float, float, float]:
-    x, y, z = (_finite(v) for v in values)
+    x, y, z = _row(values)
     return (x, y, z)
+
+
+def _row(values: Any) -> tuple[float, ...]:
+    if not isinstance(values, list | tuple):
+        raise ValueError(f"{str(values)[:40]} where there should be a row of numbers")
+    return tuple(_finite(value) for value in values)
+
+
+def _object(value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"{type(value).__name__} where there should be a JSON object")
+    return value
+
+
+def _radians(degrees: tuple[float, float, float]) -> tuple[float, float, float]:
+    a, b, c = np.deg2rad(degrees).tolist()
+    return (a, b, c)

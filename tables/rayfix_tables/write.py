@@ -5,7 +5,6 @@ import io
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,56 +23,18 @@ from rayfix_tables.disk.schema import (
     content_id,
     dataset_paths,
     level_path,
+    read_text,
+    write_text,
 )
 from rayfix_tables.errors import RayfixError, TableError
-from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES
+from rayfix_tables.part import StationPart, Update
+from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo
-from rayfix_tables.update import Update
 
-
-@dataclass(frozen=True, kw_only=True)
-class StationContent:
-    """A station's part of the table.
-
-    Attributes
-    ----------
-    lost_ray_share : float
-        Share of the launched rays that left the scene without having come to their last reflection.
-    coverage : tuple of float
-        Share of the free space that is reached with at most 0, 1, 2, ... reflections.
-    part_id : str
-        Names all that decided the part's content, so that a later build can tell whether it is still right.
-    update : Update, optional
-        Of a part with cells that a whole build would have made slightly differently.
-    """
-
-    levels: tuple[Level, ...]
-    lost_ray_share: float
-    coverage: tuple[float, ...]
-    part_id: str = ""
-    update: Update | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneContent:
-    """The scene's part of the table.
-
-    Attributes
-    ----------
-    vertices : ndarray of shape (n_vertices, 3), m
-    faces : ndarray of int, shape (n_faces, 3)
-    face_materials : ndarray of int, shape (n_faces,)
-        Index into ``materials``; -1 for none.
-    """
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    face_materials: NDArray[np.int16]
-    materials: tuple[str, ...]
-    free_space: FreeSpace
-    sha256: str
+_LIBVER = ("v108", "v108")
+"""Of HDF5's own structures: those since 1.8 have checksums, so that a damaged one is found and not followed."""
 
 
 def check_folder(path: Path, error: type[RayfixError]) -> None:
@@ -111,8 +72,8 @@ def write_table(
     path: Path,
     *,
     site: SiteInfo,
-    scene: SceneContent,
-    stations: Sequence[StationContent],
+    scene: Scene,
+    parts: Sequence[StationPart],
     software_version: str,
 ) -> str:
     """Write a table file and return its ``table_id``.
@@ -121,22 +82,26 @@ def write_table(
 
     Parameters
     ----------
-    stations : sequence of StationContent
-        In the order of ``site.stations``.
+    parts : sequence of StationPart
+        Of ``site.stations``, in their order.
 
     Raises
     ------
+    ValueError
+        When the parts are of other stations.
     TableError
         When the disk is full or the folder cannot be written; no partial file is left.
     """
+    if [part.station for part in parts] != list(site.stations):
+        raise ValueError("the parts of a table are those of its site's stations, in their order")
     remove_abandoned(path.parent, f".{path.name}.partial-")
     partial = None
     try:
         partial, descriptor = own_file(path.parent, f".{path.name}.partial-")
         with _Sink(descriptor, "w+") as sink:
             try:
-                with h5py.File(sink, "w", alignment_threshold=1, alignment_interval=64) as file:
-                    table_id = _write_content(file, site, scene, stations, software_version)
+                with h5py.File(sink, "w", libver=_LIBVER, alignment_threshold=1, alignment_interval=64) as file:
+                    table_id = _write_content(file, site, scene, parts, software_version)
             finally:
                 sink.raise_failure()
             os.fsync(sink.fileno())
@@ -195,39 +160,46 @@ class _Sink(io.FileIO):
 def _write_content(
     file: h5py.File,
     site: SiteInfo,
-    scene: SceneContent,
-    stations: Sequence[StationContent],
+    scene: Scene,
+    parts: Sequence[StationPart],
     software_version: str,
 ) -> str:
+    _write_json(file, "site", _site_document(site))
     _write_scene(file, scene)
-    for station, content in zip(site.stations, stations, strict=True):
-        group = file.create_group(f"stations/{station.id}")
-        group.attrs["position_m"] = np.asarray(station.position)
-        group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
-        group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
-        for name, value in bias_attributes(station.bias).items():
-            group.attrs[name] = value
-        group.attrs["part_id"] = content.part_id
-        group.attrs["lost_ray_share"] = content.lost_ray_share
-        group.attrs["coverage"] = np.asarray(content.coverage)
-        for n, level in enumerate(content.levels):
-            _write_level(file.create_group(level_path(station.id, n)), level)
-        if content.update is not None:
-            _write_update(group, content.update)
-    file.attrs["format"] = FORMAT
+    for part in parts:
+        _write_part(file, part, scene.origin)
     file.attrs["format_version"] = FORMAT_VERSION
-    file.attrs["software_version"] = software_version
-    file.attrs["scene_sha256"] = scene.sha256
-    file.attrs["site"] = json.dumps(_site_document(site), sort_keys=True)
-    digests = {name: str(file[name].attrs["sha256"]) for name in dataset_paths(file)}
+    for name, text in (("format", FORMAT), ("software_version", software_version), ("scene_sha256", scene.sha256)):
+        write_text(file, name, text)
+    digests = {name: read_text(file[name], "sha256") for name in dataset_paths(file)}
     table_id = content_id(content_attributes(file), digests)
-    file.attrs["table_id"] = table_id
+    write_text(file, "table_id", table_id)
     return table_id
 
 
-def _write_scene(file: h5py.File, scene: SceneContent) -> None:
+def _write_part(file: h5py.File, part: StationPart, origin: NDArray[np.float64]) -> None:
+    station = part.station
+    group = file.create_group(f"stations/{station.id}")
+    group.attrs["position_m"] = np.asarray(station.position) - origin
+    group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
+    group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
+    for name, value in bias_attributes(station.bias).items():
+        group.attrs[name] = value
+    write_text(group, "part_id", part.part_id)
+    group.attrs["lost_ray_share"] = part.lost_ray_share
+    group.attrs["coverage"] = np.asarray(part.coverage)
+    for n, level in enumerate(part.levels):
+        _write_level(file.create_group(level_path(station.id, n)), level)
+    if part.update is not None:
+        _write_update(group, part.update)
+
+
+def _write_scene(file: h5py.File, scene: Scene) -> None:
     group = file.create_group("scene")
-    group.attrs["materials"] = json.dumps(scene.materials)
+    if scene.origin.any():
+        group.attrs["origin_m"] = scene.origin
+        scene = scene.in_table_frame
+    _write_json(group, "materials", scene.materials)
     _write(group, "vertices_m", scene.vertices.astype(np.float64))
     _write(group, "faces", scene.faces.astype(np.int32))
     _write(group, "face_materials", scene.face_materials.astype(np.int16))
@@ -249,16 +221,20 @@ def _write_level(group: h5py.Group, level: Level) -> None:
 
 
 def _write_update(group: h5py.Group, update: Update) -> None:
-    group.attrs["exact_part_id"] = update.exact_part_id
-    group.attrs["former_part_id"] = update.former_part_id
+    write_text(group, "exact_part_id", update.exact_part_id)
+    write_text(group, "former_part_id", update.former_part_id)
     group.attrs["update_tolerance"] = update.tolerance
     for n, change in enumerate(update.cell_change):
         _write(group[f"levels/{n}"], "cell_change", change.astype(np.float32))
 
 
+def _write_json(group: h5py.Group, name: str, document: Any) -> None:
+    _write(group, name, np.frombuffer(json.dumps(document, sort_keys=True).encode(), np.uint8))
+
+
 def _write(group: h5py.Group, name: str, array: NDArray[Any]) -> h5py.Dataset:
     dataset = group.create_dataset(name, data=array)
-    dataset.attrs["sha256"] = array_digest(array)
+    write_text(dataset, "sha256", array_digest(array))
     return dataset
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from numpy.typing import NDArray
 
 from rayfix.cli import main
 from rayfix_offline.check import check_site
@@ -109,21 +110,44 @@ def test_the_command(tmp_path: Path, write_site: WriteSite, capsys: pytest.Captu
     assert document["scene"]["triangles"] == 36
 
 
-@pytest.mark.parametrize(("distance", "severity"), [(50_000.0, "warning"), (5_412_330.0, "error")])
-def test_a_sound_scene_on_map_coordinates_has_no_holes(distance: float, severity: str, tmp_path: Path) -> None:
-    """The one finding says in which steps a table would hold positions there, and how to move."""
-    corners = [(x + 300.0, y + distance, z) for x in (0.0, 4.0) for y in (0.0, 5.0) for z in (0.0, 3.0)]
-    faces = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in corners] + [f"f {face}" for face in faces]
-    (tmp_path / "room.obj").write_text("\n".join(lines))
-    (tmp_path / "site.toml").write_text(
-        '[site]\nname = "a"\nscene = "room.obj"\n[propagation]\nmax_reflections = 2\n'
-        f'[[stations]]\nid = "s"\nposition_m = [303.6, {distance + 0.4}, 2.6]\n'
+def write_far_room(folder: Path, shift: NDArray[np.float64], *, file_type: str) -> Path:
+    """Write a room of 4 x 5 x 3 m with one station, moved by a vector."""
+    room = trimesh.creation.box(bounds=[(0, 0, 0), (4, 5, 3)])
+    room.invert()
+    if file_type == "obj":
+        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in (room.vertices + shift).tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in room.faces + 1]
+        (folder / "room.obj").write_text("\n".join(lines))
+    else:
+        moved = trimesh.Scene()
+        if file_type == "glb":  # moved by its node
+            moved.add_geometry(room, node_name="room", transform=trimesh.transformations.translation_matrix(shift))
+        else:
+            moved.add_geometry(room.apply_translation(shift), node_name="room")
+        (folder / f"room.{file_type}").write_bytes(moved.export(file_type=file_type))
+    station = np.add(shift, (3.6, 0.4, 2.6)).round(3).tolist()
+    path = folder / "site.toml"
+    path.write_text(
+        f'[site]\nname = "a"\nscene = "room.{file_type}"\n[propagation]\nmax_reflections = 2\n'
+        f'[[stations]]\nid = "s"\nposition_m = {station}\n'
     )
-    check = check_site(tmp_path / "site.toml")
-    (finding,) = check.findings
-    assert (finding.kind, finding.severity) == ("origin", severity)
-    step = float(np.spacing(np.float32(distance)))
-    assert f"in steps of {step:.3g} m" in finding.problem
-    assert f"by (-302, {-round(distance + 2.5)}, -2) m" in finding.remedy
+    return path
+
+
+@pytest.mark.parametrize("file_type", ["obj", "glb"])
+@pytest.mark.parametrize("distance", [50_000.0, 5_412_330.0])
+def test_a_sound_scene_on_map_coordinates_has_no_finding(distance: float, file_type: str, tmp_path: Path) -> None:
+    path = write_far_room(tmp_path, np.array([300.0, distance, 12.0]), file_type=file_type)
+    check = check_site(path)
+    assert check.findings == ()
     assert [escapes.share for escapes in check.escapes] == [0.0]
+
+
+def test_map_coordinates_in_single_precision_are_told(tmp_path: Path) -> None:
+    """Walls of such a file lie where single precision has a number."""
+    path = write_far_room(tmp_path, np.array([448_250.3, 5_412_330.2, 12.0]), file_type="stl")
+    (finding,) = [finding for finding in check_site(path).findings if finding.kind == "precision"]
+    assert finding.severity == "warning"
+    assert "that they have steps of up to 0.5 m" in finding.problem
+    near = write_far_room(tmp_path, np.array([20_000.0, 30_000.0, 12.0]), file_type="stl")
+    assert not [finding for finding in check_site(near).findings if finding.kind == "precision"]

@@ -19,15 +19,16 @@ from rayfix_service.http.answering import served_tables, table_checks
 from rayfix_service.http.answering.served_tables import load_tables
 from rayfix_service.server.server import serve
 from rayfix_tables.checked import CheckLimits
+from rayfix_tables.disk.schema import write_text
 from rayfix_tables.errors import TableError
+from tests.support.checkout import ROOT
 from tests.support.hand_tables import line_of_sight, table_of
-from tests.support.random_tables import random_content
 from tests.support.running_app import RunningApp
 from tests.support.server_process import ServerProcess, start_server
 from tests.support.table_flips import flipped
 
 POLL = 0.05  # s
-HANGS = (2985, 3)  # a bit of the small random table with which HDF5 2.0 is busy for ever
+HANGS = (2985, 3)  # a bit of the stored table with which HDF5 2.0 is busy for ever
 SHORT = CheckLimits(seconds=1.0)
 
 
@@ -43,8 +44,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def hanging(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a file that HDF5 reads for ever."""
     path = tmp_path_factory.mktemp("hanging") / "hanging.h5"
-    random_content(1, num_stations=1, num_levels=1).write(path)
-    path.write_bytes(flipped(path.read_bytes(), *HANGS))
+    path.write_bytes(flipped((ROOT / "tests/tables/stored/format-1.h5").read_bytes(), *HANGS))
     return path
 
 
@@ -267,7 +267,7 @@ def test_the_old_table_answers_from_new_workers_while_its_file_is_bad(table: Pat
     with start_server(path, workers=2, settings=settings) as server:
         table_id = readiness(server)["tables"][0]["table_id"]  # type: ignore[index]
         with h5py.File(shutil.copy(table, tmp_path / "next"), "r+") as file:
-            file.attrs["software_version"] = "next"
+            write_text(file, "software_version", "next")
         os.replace(tmp_path / "next", path)
         server.wait_for("loaded table hall", 2)
         time.sleep(1.5)  # the first process looks twice a second

@@ -31,10 +31,10 @@ class SlowMixture(TubeMixture):
 
 def slow(content: Content) -> Content:
     """Replace the last level's mixture by a slow one, so that most is written already."""
-    last = content.stations[-1]
+    last = content.parts[-1]
     level = last.levels[-1]
     levels = (*last.levels[:-1], replace(level, mixture=SlowMixture(**vars(level.mixture))))
-    return replace(content, stations=(*content.stations[:-1], replace(last, levels=levels)))
+    return replace(content, parts=(*content.parts[:-1], replace(last, levels=levels)))
 
 
 @pytest.fixture(autouse=True)

@@ -22,9 +22,11 @@ from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture, pack
+from rayfix_tables.part import StationPart
+from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table
-from rayfix_tables.write import SceneContent, StationContent, write_table
+from rayfix_tables.write import write_table
 
 Array = NDArray[np.float64]
 
@@ -86,7 +88,7 @@ def line_of_sight(
     )
 
 
-def station_content(tubes: list[Tube]) -> StationContent:
+def station_part(station: Station, tubes: list[Tube]) -> StationPart:
     offsets, masses = np.zeros(GRID.num_cells + 1, np.int64), np.full(GRID.num_cells, -np.inf)
     tubes = sorted(tubes, key=lambda tube: tube.cell)
     for tube in tubes:
@@ -104,7 +106,7 @@ def station_content(tubes: list[Tube]) -> StationContent:
             num_reflections=np.array([tube.num_reflections for tube in tubes], np.int8),
         )
     level = Level(window=WINDOW, grid=GRID, cell_offsets=offsets, cell_log_mass=masses, mixture=mixture)
-    return StationContent(levels=(level,), lost_ray_share=0.0, coverage=(1.0,))
+    return StationPart(station=station, levels=(level,), lost_ray_share=0.0, coverage=(1.0,))
 
 
 def table_of(
@@ -116,7 +118,7 @@ def table_of(
     """Write a table of the stations a, b and c, or of others, to a path and open it."""
     known = stations or {name: Station(id=name, position=position) for name, position in POSITIONS.items()}
     free_space = FreeSpace(origin=ORIGIN, voxel_size=1.0, free=np.ones((SIDE,) * 3, np.bool_) if free is None else free)
-    scene = SceneContent(
+    scene = Scene(
         vertices=np.zeros((3, 3)),
         faces=np.array([[0, 1, 2]], np.int32),
         face_materials=np.array([-1], np.int16),
@@ -128,7 +130,7 @@ def table_of(
         path,
         site=SiteInfo(name="box", north=0.0, max_path_length=MAX_PATH_LENGTH, stations=tuple(known.values())),
         scene=scene,
-        stations=[station_content([t for t in tubes if t.station_id == name]) for name in known],
+        parts=[station_part(each, [t for t in tubes if t.station_id == name]) for name, each in known.items()],
         software_version="0",
     )
     return Table.open(path)

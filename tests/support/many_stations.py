@@ -3,9 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
+from rayfix_tables.part import StationPart
 from rayfix_tables.site import SiteInfo
 from rayfix_tables.table import Table
-from rayfix_tables.write import SceneContent, StationContent, write_table
+from rayfix_tables.write import write_table
 
 
 def many_stations(source: Path, path: Path, count: int) -> Path:
@@ -14,7 +15,6 @@ def many_stations(source: Path, path: Path, count: int) -> Path:
     parts = list(table.parts.values())
     copies = [parts[n % len(parts)] for n in range(count)]
     stations = [replace(part.station, id=f"s{n:02}") for n, part in enumerate(copies)]
-    scene = table.scene
     write_table(
         path,
         site=SiteInfo(
@@ -23,16 +23,10 @@ def many_stations(source: Path, path: Path, count: int) -> Path:
             max_path_length=table.site.max_path_length,
             stations=tuple(stations),
         ),
-        scene=SceneContent(
-            vertices=scene.vertices,
-            faces=scene.faces,
-            face_materials=scene.face_materials,
-            materials=scene.materials,
-            free_space=scene.free_space,
-            sha256=scene.sha256,
-        ),
-        stations=[
-            StationContent(levels=part.levels[-1:], lost_ray_share=0.0, coverage=part.coverage) for part in copies
+        scene=table.scene,
+        parts=[
+            StationPart(station=station, levels=part.levels[-1:], lost_ray_share=0.0, coverage=part.coverage)
+            for station, part in zip(stations, copies, strict=True)
         ],
         software_version="0",
     )

@@ -9,8 +9,10 @@ from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+from rayfix_tables.part import StationPart
+from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station, StationBias
-from rayfix_tables.write import SceneContent, StationContent, write_table
+from rayfix_tables.write import write_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,14 +20,12 @@ class Content:
     """What a table is written from."""
 
     site: SiteInfo
-    scene: SceneContent
-    stations: tuple[StationContent, ...]
+    scene: Scene
+    parts: tuple[StationPart, ...]
 
     def write(self, path: Path, *, software_version: str = "1.2.3") -> str:
         """Write it and return its ``table_id``."""
-        return write_table(
-            path, site=self.site, scene=self.scene, stations=self.stations, software_version=software_version
-        )
+        return write_table(path, site=self.site, scene=self.scene, parts=self.parts, software_version=software_version)
 
 
 def random_mixture(rng: np.random.Generator, count: int) -> TubeMixture:
@@ -40,7 +40,7 @@ def random_content(
 ) -> Content:
     """Fill a table with random numbers; cells hold none to ``max_components`` components."""
     rng = np.random.default_rng(seed)
-    stations, contents = [], []
+    stations, parts = [], []
     for n in range(num_stations):
         stations.append(
             Station(
@@ -71,8 +71,13 @@ def random_content(
                     log_balance=rng.normal(size=int(counts.sum()) * (not levels)).astype(np.float32),  # the first only
                 )
             )
-        contents.append(
-            StationContent(levels=tuple(levels), lost_ray_share=rng.random(), coverage=tuple(rng.random(3).tolist()))
+        parts.append(
+            StationPart(
+                station=stations[-1],
+                levels=tuple(levels),
+                lost_ray_share=rng.random(),
+                coverage=tuple(rng.random(3).tolist()),
+            )
         )
     return Content(
         site=SiteInfo(
@@ -82,7 +87,7 @@ def random_content(
             stations=tuple(stations),
             document={"site": {"name": "ß", "seed": seed}, "stations": [s.id for s in stations]},
         ),
-        scene=SceneContent(
+        scene=Scene(
             vertices=rng.normal(size=(3 * num_faces, 3)),
             faces=rng.integers(0, 3 * num_faces, (num_faces, 3)).astype(np.int32),
             face_materials=rng.integers(-1, 2, num_faces).astype(np.int16),
@@ -90,5 +95,5 @@ def random_content(
             free_space=FreeSpace(origin=rng.normal(size=3), voxel_size=0.1, free=rng.random((3, 4, 2)) < 0.5),
             sha256=f"{seed:064x}",
         ),
-        stations=tuple(contents),
+        parts=tuple(parts),
     )

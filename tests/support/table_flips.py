@@ -19,6 +19,7 @@ import h5py
 
 from rayfix_tables.checking import check, limit_this_process
 from rayfix_tables.disk.files import open_table_file
+from rayfix_tables.disk.schema import read_text
 from rayfix_tables.errors import TableError
 
 MEMORY = 256_000_000
@@ -110,7 +111,7 @@ def _check(path: Path, writing: int, seconds: int) -> None:
 
 def _table_id(path: Path) -> str:
     with h5py.File(path) as file:
-        return str(file.attrs["table_id"])
+        return read_text(file, "table_id")
 
 
 def peak_bytes_of_children() -> int:

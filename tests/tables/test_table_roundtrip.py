@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rayfix_tables.disk.schema import FORMAT_VERSION, array_digest
+from rayfix_tables.disk.schema import FORMAT_VERSION, array_digest, read_text
 from rayfix_tables.errors import CorruptTableError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
+from rayfix_tables.part import Update
 from rayfix_tables.site import NO_BIAS, Station
 from rayfix_tables.table import Table
-from rayfix_tables.update import Update
 
 DEGREES = 1e-14  # relative; angles are stored in degrees
 
@@ -38,7 +38,7 @@ def assert_same_table(table: Table, content: Any) -> None:
     assert table.site.document == site.document
     assert table.site.north == pytest.approx(site.north, rel=DEGREES)
     assert list(table.parts) == [station.id for station in site.stations]
-    for station, written, part in zip(site.stations, content.stations, table.parts.values(), strict=True):
+    for station, written, part in zip(site.stations, content.parts, table.parts.values(), strict=True):
         assert part.station.id == station.id
         assert part.station.position == station.position
         assert part.station.orientation == pytest.approx(station.orientation, rel=DEGREES)
@@ -100,9 +100,16 @@ def test_round_trip(
     assert [entry.name for entry in path.parent.iterdir()] == ["table.h5"]
 
 
+def test_parts_of_other_stations_are_refused(make_content: Callable[..., Any], tmp_path: Path) -> None:
+    content = make_content(0)
+    with pytest.raises(ValueError, match="the parts of a table are those of its site's stations"):
+        replace(content, parts=content.parts[::-1]).write(tmp_path / "t.h5")
+    assert not list(tmp_path.iterdir())
+
+
 def test_extreme_numbers_come_back(make_content: Callable[..., Any], tmp_path: Path) -> None:
     content = make_content(0, num_stations=1, num_levels=1)
-    level = content.stations[0].levels[0]
+    level = content.parts[0].levels[0]
     extremes = np.array([-0.0, 0.0, -3.4e38, 1.2e-38, 1e-45, 3.4e38], np.float32)
     level.mixture.u_cov[0] = extremes
     content.write(tmp_path / "t.h5")
@@ -113,10 +120,10 @@ def test_extreme_numbers_come_back(make_content: Callable[..., Any], tmp_path: P
 
 def test_double_precision_is_rounded_to_the_stored_types(make_content: Callable[..., Any], tmp_path: Path) -> None:
     content = make_content(0, num_stations=1, num_levels=1)
-    level = content.stations[0].levels[0]
+    level = content.parts[0].levels[0]
     doubles = {f.name: getattr(level.mixture, f.name) * np.float64(np.pi) for f in fields(level.mixture)}
     exact = replace(level, mixture=replace(level.mixture, **doubles))
-    replace(content, stations=(replace(content.stations[0], levels=(exact,)),)).write(tmp_path / "t.h5")
+    replace(content, parts=(replace(content.parts[0], levels=(exact,)),)).write(tmp_path / "t.h5")
     mixture = Table.open(tmp_path / "t.h5").levels("bs0")[0].mixture
     for name, dtype in FIELD_DTYPES.items():
         assert_same_bits(getattr(mixture, name), doubles[name].astype(dtype))
@@ -126,7 +133,7 @@ def test_a_cell_is_its_slice_of_the_components(make_content: Callable[..., Any],
     content = make_content(3, num_stations=1, num_levels=1)
     content.write(tmp_path / "t.h5")
     level = Table.open(tmp_path / "t.h5").levels("bs0")[0]
-    written = content.stations[0].levels[0]
+    written = content.parts[0].levels[0]
     counts = [len(level.cell(i)) for i in range(level.num_cells)]
     assert counts == np.diff(written.cell_offsets).tolist()
     assert 0 in counts
@@ -135,7 +142,7 @@ def test_a_cell_is_its_slice_of_the_components(make_content: Callable[..., Any],
 
 
 def test_ranges_of_cells_are_all_cells_in_order(make_content: Callable[..., Any]) -> None:
-    level = make_content(3).stations[0].levels[0]
+    level = make_content(3).parts[0].levels[0]
     counts = np.diff(level.cell_offsets)
     for most in (1, 4, 10**6):
         ranges = list(level.ranges(most))
@@ -152,6 +159,51 @@ def test_a_table_written_before_there_were_biases_has_none(small_table_path: Pat
             for name in [name for name in group.attrs if "bias" in name]:
                 del group.attrs[name]
     assert all(station.bias == NO_BIAS for station in Table.open(path).site.stations)
+
+
+def test_a_table_of_format_1_is_still_read(make_content: Callable[..., Any]) -> None:
+    """Its texts are attributes of variable length."""
+    path = Path(__file__).parent / "stored" / "format-1.h5"
+    table = Table.open(path)
+    assert_same_table(table, make_content(1, num_stations=1, num_levels=1))
+    assert table.format_version == 1
+    assert table.table_id == "4506b08f92814eda2c4c9d246dbb340c18f557041afaf38eb6bdc473c134eea3"
+    table.verify()
+
+
+def far_content(make_content: Callable[..., Any]) -> Any:
+    """Content whose scene and stations lie at whole metres far away; components count from there."""
+    content = make_content(7)
+    origin = np.array([448254.0, 5412335.0, 0.0])
+    stations = tuple(
+        replace(s, position=tuple((np.round(s.position, 3) + origin).tolist())) for s in content.site.stations
+    )
+    parts = tuple(replace(p, station=s) for p, s in zip(content.parts, stations, strict=True))
+    scene = replace(content.scene, vertices=np.round(content.scene.vertices, 3)).moved(origin)
+    return replace(content, site=replace(content.site, stations=stations), scene=scene, parts=parts)
+
+
+def test_a_scene_on_map_coordinates_comes_back_to_the_last_bit(
+    make_content: Callable[..., Any], tmp_path: Path
+) -> None:
+    content = far_content(make_content)
+    content.write(tmp_path / "t.h5")
+    table = Table.open(tmp_path / "t.h5")
+    assert_same_table(table, content)
+    assert_same_bits(table.scene.origin, content.scene.origin)
+    table.verify()
+    with h5py.File(tmp_path / "t.h5") as file:
+        assert np.abs(file["scene/vertices_m"][()]).max() < 10.0
+        assert np.abs(file["stations/bs0"].attrs["position_m"]).max() < 10.0
+        assert np.abs(file["scene/free_space"].attrs["origin_m"]).max() < 10.0
+
+
+def test_near_the_origin_nothing_is_said_of_it(small_table_path: Path) -> None:
+    with h5py.File(small_table_path) as file:
+        assert "origin_m" not in file["scene"].attrs
+    table = Table.open(small_table_path)
+    assert table.scene.in_table_frame is table.scene
+    assert not table.scene.origin.any()
 
 
 def test_arrays_are_mapped_and_cannot_be_written(small_table_path: Path) -> None:
@@ -173,9 +225,9 @@ def test_arrays_are_mapped_and_cannot_be_written(small_table_path: Path) -> None
 def test_the_site_is_plain_json(small_table_path: Path, make_content: Callable[..., Any]) -> None:
     """Other programs can read it."""
     with h5py.File(small_table_path) as file:
-        assert file.attrs["format"] == "rayfix-table"
+        assert read_text(file, "format") == "rayfix-table"
         assert file.attrs["format_version"] == FORMAT_VERSION
-        document = json.loads(file.attrs["site"])
+        document = json.loads(file["site"][()].tobytes())
     site = make_content(1).site
     assert document["station_ids"] == ["bs0", "bs1"]
     assert document["north_deg"] == pytest.approx(np.rad2deg(site.north), rel=DEGREES)
@@ -217,20 +269,21 @@ def nudged(array: np.ndarray) -> np.ndarray:
 def variations(content: Any) -> dict[str, Any]:
     """Contents that differ in one thing each."""
     near = 1.0 + 1e-12
-    site, scene, (first, *others) = content.site, content.scene, content.stations
+    site, scene, (first, *others) = content.site, content.scene, content.parts
     level, *coarser = first.levels
     station, *stations = site.stations
 
     def with_station(**changes: Any) -> Any:
         changed = Station(**{**{f.name: getattr(station, f.name) for f in fields(station)}, **changes})
-        return replace(content, site=replace(site, stations=(changed, *stations)))
+        part = replace(first, station=changed)
+        return replace(content, site=replace(site, stations=(changed, *stations)), parts=(part, *others))
 
     def with_level(**changes: Any) -> Any:
         levels = (replace(level, **changes), *coarser)
-        return replace(content, stations=(replace(first, levels=levels), *others))
+        return replace(content, parts=(replace(first, levels=levels), *others))
 
     def with_part(**changes: Any) -> Any:
-        return replace(content, stations=(replace(first, **changes), *others))
+        return replace(content, parts=(replace(first, **changes), *others))
 
     def with_scene(**changes: Any) -> Any:
         return replace(content, scene=replace(scene, **changes))
@@ -283,10 +336,10 @@ def test_the_id_changes_with_every_part_of_the_content(make_content: Callable[..
 def with_update(content: Any, seed: int = 0) -> Any:
     """Content whose first station was updated."""
     rng = np.random.default_rng(seed)
-    first = content.stations[0]
+    first = content.parts[0]
     change = tuple((0.01 * rng.random(level.num_cells)).astype(np.float32) for level in first.levels)
     update = Update(exact_part_id="e" * 64, former_part_id="f" * 64, tolerance=0.01, cell_change=change)
-    return replace(content, stations=(replace(first, update=update), *content.stations[1:]))
+    return replace(content, parts=(replace(first, update=update), *content.parts[1:]))
 
 
 def test_an_update_is_part_of_the_table(make_content: Callable[..., Any], tmp_path: Path) -> None:
@@ -298,7 +351,7 @@ def test_an_update_is_part_of_the_table(make_content: Callable[..., Any], tmp_pa
     assert_same_table(table, updated)
     first, second = table.parts.values()
     assert second.update is None
-    expected = updated.stations[0].update
+    expected = updated.parts[0].update
     for ours, theirs in zip(first.update.cell_change, expected.cell_change, strict=True):
         assert_same_bits(ours, theirs)
     assert replace(first.update, cell_change=()) == replace(expected, cell_change=())

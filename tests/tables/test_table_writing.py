@@ -46,11 +46,11 @@ class InterruptedMixture(TubeMixture):
 
 def interrupted(content: Any) -> Any:
     """Replace the last level's mixture by one that is interrupted, so that most is written already."""
-    last = content.stations[-1]
+    last = content.parts[-1]
     level = last.levels[-1]
     mixture = InterruptedMixture(**vars(level.mixture))
     levels = (*last.levels[:-1], replace(level, mixture=mixture))
-    return replace(content, stations=(*content.stations[:-1], replace(last, levels=levels)))
+    return replace(content, parts=(*content.parts[:-1], replace(last, levels=levels)))
 
 
 @contextmanager

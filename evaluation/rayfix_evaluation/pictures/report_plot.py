@@ -125,7 +125,7 @@ def _station_mixture(
         cov = cov - gain[:, :, None] * cov[:, None, 3, :]
     if len(log_weight):
         log_weight = log_weight - np.logaddexp.reduce(log_weight)
-    return np.exp(log_weight), mean[:, :3], cov[:, :3, :3]
+    return np.exp(log_weight), mean[:, :3] + table.scene.origin, cov[:, :3, :3]
 
 
 def _draw_rays(

@@ -137,7 +137,7 @@ def forecast(table: Table, settings: PlanSettings, progress: Progress | None = N
     squares, places = draw_places(table, settings.height, settings.spacing, settings.draws, rng)
     stations = table.site.stations
     noise = rng.standard_normal((len(places), len(stations), 3))
-    paths = [audible_paths(table.levels(station.id)[0], places) for station in stations]
+    paths = [audible_paths(table.levels(station.id)[0], places - table.scene.origin) for station in stations]
     locator = Locator(table)
     bound, square, within = np.empty(len(places)), np.empty(len(places)), np.empty(len(places))
     for n in range(len(places)):

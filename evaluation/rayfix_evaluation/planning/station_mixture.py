@@ -66,6 +66,7 @@ def audible_paths(level: Level, places: Array) -> AudiblePaths:
     level : Level
         The station's finest.
     places : ndarray of shape (n, 3), m
+        In the table's frame.
     """
     order = np.argsort(places[:, 0], kind="stable")
     ordered = np.ascontiguousarray(places[order])

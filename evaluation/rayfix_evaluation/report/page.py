@@ -6,6 +6,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -169,6 +170,7 @@ def _site_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
     size = " x ".join(f"{v:.3g}" for v in vertices.max(axis=0) - vertices.min(axis=0))
     heard = ", ".join(f"{n} by {k}" for k, n in drops["by_stations"].items())
     propagation = table.site.document["propagation"]
+    origin = results["origin_m"]
     return [
         (
             "Scene",
@@ -176,7 +178,15 @@ def _site_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
         ),
         (
             "Stations",
-            ", ".join(f"{s.id} at ({', '.join(f'{v:g}' for v in s.position)}) m" for s in table.site.stations),
+            ", ".join(
+                f"{s.id} at ({', '.join(f'{v:.10g}' for v in np.round(np.add(s.position, origin), 6))}) m"
+                for s in table.site.stations
+            ),
+        ),
+        *(
+            [("Figures and maps", f"their coordinates count from ({', '.join(f'{v:.0f}' for v in origin)}) m")]
+            if any(origin)
+            else []
         ),
         ("Paths", f"up to {propagation['max_reflections']} reflections and {propagation['max_path_length_m']:g} m"),
         (

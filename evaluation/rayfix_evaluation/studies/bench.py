@@ -53,7 +53,7 @@ class Bench:
 
     def __init__(self, settings: BenchSettings) -> None:
         self.settings = settings
-        self.table = Table.open(settings.tables["site"])
+        self.table = Table.open(settings.tables["site"]).in_table_frame
         self._solvers: dict[World, dict[str, StationSolver]] = {}
         self._drops: dict[tuple[World, int], Drop] = {}
         self._methods: dict[str, Answering] = {}

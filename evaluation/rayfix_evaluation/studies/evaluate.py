@@ -96,7 +96,8 @@ def evaluate_site(
     except OSError as error:
         raise RayfixError(f"cannot write {work}: {error.strerror}; choose another folder with -o") from error
     site_table = open_site_table(site_path, table_path, work / "tables", jobs=jobs, progress=progress)
-    table = open_checked(site_table, whole=False)
+    opened = open_checked(site_table, whole=False)
+    table = opened.in_table_frame  # fits of the methods beside rayfix would lose digits on map coordinates
     planned = studies(
         effort,
         station_ids=[station.id for station in table.site.stations],
@@ -129,6 +130,7 @@ def evaluate_site(
         "effort": asdict(effort),
         "seed": seed,
         "table_id": table.table_id,
+        "origin_m": opened.scene.origin.tolist(),
         "tables": identities,
         "software_version": software_version(),
         "code": code_digest(),
@@ -226,7 +228,7 @@ class _Runner:
         if any(METHODS[task.method].needs_map for task in missing):
             self.progress("mapping fingerprints", 0, 1)
             settings = replace(
-                settings, radio_map=simulate_map(Table.open(settings.tables[SITE]), spacing=self.spacing)
+                settings, radio_map=simulate_map(Table.open(settings.tables[SITE]).in_table_frame, spacing=self.spacing)
             )
             self.progress("mapping fingerprints", 1, 1)
         for finished in run_tasks(settings, missing, jobs=self.jobs, advance=advance):

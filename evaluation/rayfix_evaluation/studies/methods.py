@@ -84,8 +84,8 @@ class Tools:
     radio_map: RadioMap | None = None
 
     def table(self, variant: str) -> Table:
-        """Open a variant of the table."""
-        return Table.open(self.tables[variant])
+        """Open a variant of the table, in its own frame."""
+        return Table.open(self.tables[variant]).in_table_frame
 
 
 @dataclass(frozen=True, kw_only=True)

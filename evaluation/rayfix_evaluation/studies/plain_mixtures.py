@@ -53,7 +53,7 @@ class PlainTableLocator:
                 mixtures.append(mixture)
         if not mixtures:
             return None
-        return arg_max(mixtures, multiply(mixtures, _MOST_PRODUCTS).mean)
+        return arg_max(mixtures, multiply(mixtures, _MOST_PRODUCTS).mean) + self.table.scene.origin
 
     def _mixture(
         self, levels: Sequence[Level], direction: Direction, measured: tuple[float, float] | None

@@ -12,7 +12,7 @@ from rayfix_offline.rays.trace import level_grid
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin.twin import Twin
 from rayfix_tables.angles import direction, local_to_scene
-from rayfix_tables.disk.schema import FORMAT_VERSION
+from rayfix_tables.disk.schema import ARRAYS_VERSION
 from rayfix_tables.site import Station
 
 BUILD_VERSION = 5
@@ -100,7 +100,7 @@ def plan_build(site: SiteFile, twin: Twin, method: Method | None = None) -> tupl
     method = method or Method()
     common = content_key(
         BUILD_VERSION,
-        FORMAT_VERSION,
+        ARRAYS_VERSION,
         method.identity(),
         twin.scene.sha256,
         hashlib.sha256(np.packbits(twin.free_space.free).tobytes()).hexdigest(),

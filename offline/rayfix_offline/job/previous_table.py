@@ -23,7 +23,8 @@ from rayfix_offline.site import SiteFile, parse_site
 from rayfix_offline.twin.twin import Twin, prepare_scene
 from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import SiteError, TableError
-from rayfix_tables.table import StationPart, Table
+from rayfix_tables.part import StationPart
+from rayfix_tables.table import Table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,12 +114,17 @@ class FormerTable:
         return None
 
     def station(self, plan: StationPlan, site: SiteFile) -> FormerStation | None:
-        """Return the former station at the position of a plan's, if its rays have the same launch directions."""
+        """Return the former station at the position of a plan's, if its rays have the same launch directions.
+
+        Positions are compared in the tables' frames.
+        """
         part = self.table.parts.get(plan.station.id)
-        if part is None or part.station.position != plan.station.position or not self._sound or not self._inputs:
+        if part is None or not self._sound or not self._inputs:
             return None
         former_site, twin, plans = self._inputs
         former = plans[plan.station.id]
+        if former.station.position != plan.station.position:
+            return None
         expected = part.part_id
         if part.update is not None:
             expected = part.update.exact_part_id
@@ -139,7 +145,7 @@ class FormerTable:
     @cached_property
     def _inputs(self) -> tuple[SiteFile, Twin, dict[str, StationPlan]] | None:
         """Site, twin and plans of the table; None if this version of the software cannot read its site."""
-        stored = self.table.scene
+        stored = self.table.scene.in_table_frame
         scene = Scene(
             vertices=np.array(stored.vertices),
             faces=np.array(stored.faces),
@@ -149,7 +155,7 @@ class FormerTable:
             objects=("scene",),
         )
         try:
-            site = parse_site(self.table.site.document)
+            site = parse_site(self.table.site.document).moved(-self.table.scene.origin)
         except SiteError:
             return None
         twin = prepare_scene(site, scene, self.method.twin)

@@ -1,7 +1,7 @@
 """Build one station's part of a table from shards, from a former table, and by fitting the remaining cells."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,7 @@ from rayfix_offline.job.plan import Block, StationPlan, updated_part_id
 from rayfix_offline.job.previous_table import FormerStation, KeptCells
 from rayfix_offline.job.shards import ShardStore
 from rayfix_tables.level import Level
-from rayfix_tables.table import StationPart
-from rayfix_tables.update import Update
-from rayfix_tables.write import StationContent
+from rayfix_tables.part import StationPart, Update
 
 StationProgress = Callable[[str, int], None]
 """Called with the stage and the number of the station's cells that are done."""
@@ -35,7 +33,7 @@ class BuiltStation:
         Number of components dropped for want of a positive definite covariance; 0 for a part that was kept.
     """
 
-    content: StationContent
+    part: StationPart
     origin: str
     num_kept_cells: int
     num_dropped: int
@@ -46,7 +44,9 @@ def keep_station(plan: StationPlan, job: Job) -> BuiltStation | None:
     part = job.former.whole_part(plan, job.tolerance) if job.former else None
     if part is None:
         return None
-    return BuiltStation(content=_content_of(part), origin="kept", num_kept_cells=plan.num_finest_cells, num_dropped=0)
+    return BuiltStation(
+        part=replace(part, station=plan.station), origin="kept", num_kept_cells=plan.num_finest_cells, num_dropped=0
+    )
 
 
 def build_station(plan: StationPlan, job: Job, engine: FittingEngine, report: StationProgress) -> BuiltStation:
@@ -91,7 +91,7 @@ def build_station(plan: StationPlan, job: Job, engine: FittingEngine, report: St
             report(_stage(plan, job, block), done)
         levels.append(_assemble_level(n, job, parts))
     return BuiltStation(
-        content=_assemble(plan, job, former, levels, launch),
+        part=_assemble(plan, job, former, levels, launch),
         origin="updated" if num_kept else "resumed" if resumed else "built",
         num_kept_cells=num_kept,
         num_dropped=sum(int(fitted.dropped.sum()) for fitted in parts.values()),
@@ -142,7 +142,7 @@ def _assemble(
     former: FormerStation | None,
     levels: list[tuple[Level, NDArray[np.float32]]],
     launch: dict[str, Any],
-) -> StationContent:
+) -> StationPart:
     """Assemble the levels of a station."""
     part_id, update = plan.part_id, None
     change = tuple(change for _, change in levels)
@@ -154,20 +154,11 @@ def _assemble(
             tolerance=job.tolerance,
             cell_change=change,
         )
-    return StationContent(
+    return StationPart(
+        station=plan.station,
         part_id=part_id,
         update=update,
         levels=tuple(level for level, _ in levels),
         lost_ray_share=float(launch["lost_ray_share"]),
         coverage=tuple(float(fraction) for fraction in launch["coverage"]),
-    )
-
-
-def _content_of(part: StationPart) -> StationContent:
-    return StationContent(
-        part_id=part.part_id,
-        update=part.update,
-        levels=part.levels,
-        lost_ray_share=part.lost_ray_share,
-        coverage=part.coverage,
     )

@@ -1,6 +1,6 @@
 """Lost rays: the fraction of a station's rays that leave the scene, and where most of them do."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,13 @@ class Escapes:
     side_share: float
     place: tuple[float, float, float] | None
     place_share: float
+
+    def moved(self, by: NDArray[np.float64]) -> "Escapes":
+        """Return the same rays elsewhere, moved by a vector of shape (3,), m."""
+        if self.place is None:
+            return self
+        x, y, z = (np.asarray(self.place) + by).tolist()
+        return replace(self, place=(x, y, z))
 
 
 def find_escapes(station: StationSection, twin: Twin, *, max_reflections: int) -> Escapes:

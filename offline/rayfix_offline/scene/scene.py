@@ -1,8 +1,8 @@
 """The scene: a mesh file as triangles in metres, z up, with the objects and materials they belong to."""
 
 import hashlib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from rayfix_offline.scene.formats.mitsuba import read_mitsuba
 from rayfix_offline.scene.formats.obj import read_obj
 from rayfix_offline.scene.formats.ply import read_ply
 from rayfix_offline.scene.formats.stl import read_stl
-from rayfix_offline.scene.placed import MOST_TRIANGLES, Contents, Placed, Remark
+from rayfix_offline.scene.placed import MOST_TRIANGLES, Contents, Placed, Remark, counted
 from rayfix_offline.site import LARGEST_COORDINATE
 from rayfix_tables.errors import SceneError
 
@@ -40,6 +40,12 @@ UPRIGHT = {
     "z": np.eye(3),
 }
 """Rotation that turns a file's upward axis to z."""
+
+SINGLE_PRECISION = ("glb", "gltf", "ply", "stl")
+"""Files that hold, or may hold, coordinates in single precision."""
+
+COARSE = 0.005
+"""Steps of coordinates [m] above which walls of a scene lie notably off."""
 
 _MIN_AREA = 1e-12
 
@@ -89,6 +95,10 @@ class Scene:
         used = self.vertices[np.unique(self.faces)]
         return np.stack([used.min(axis=0), used.max(axis=0)])
 
+    def moved(self, by: NDArray[np.float64]) -> "Scene":
+        """Return the same scene elsewhere, moved by a vector of shape (3,), m."""
+        return replace(self, vertices=self.vertices + by) if np.any(by) else self
+
     @property
     def sha256(self) -> str:
         """Checksum of the geometry and its materials."""
@@ -137,6 +147,8 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
             f"{path} has {num_triangles:,} triangles, more than {MOST_TRIANGLES:,}; leave out what is small"
         )
     _refuse_far(path, objects, scale)
+    if kind in SINGLE_PRECISION:
+        contents = replace(contents, remarks=(*contents.remarks, *_coarse_coordinates(objects, scale)))
     scene = _gather(path, objects, contents, scale=scale, up=contents.up or up)
     if not len(scene.faces):
         raise SceneError(f"{path} has only triangles without an area; export the scene again")
@@ -153,6 +165,24 @@ def _refuse_far(path: Path, objects: list[Placed], scale: float) -> None:
                 f"{path}: the object '{each.name}' has a coordinate of {reach:.6g} m, beyond {LARGEST_COORDINATE:g} m; "
                 "correct the mesh, or scene_unit in the site file"
             )
+
+
+def _coarse_coordinates(objects: list[Placed], scale: float) -> Iterator[Remark]:
+    """Tell of map coordinates in single precision; those of nodes, which are in double, move objects without a loss."""
+    steps = [float(np.spacing(np.float32(np.abs(each.vertices).max(initial=0.0)))) * scale for each in objects]
+    coarse = [
+        (each.name, step)
+        for each, step in zip(objects, steps, strict=True)
+        if step > COARSE and np.array_equal(each.vertices, each.vertices.astype(np.float32))
+    ]
+    if coarse:
+        name, step = max(coarse, key=lambda found: found[1])
+        yield Remark(
+            kind="precision",
+            problem=f"the file holds the coordinates of {counted(len(coarse), 'object')} in single precision, so far "
+            f"from the origin that they have steps of up to {step:.3g} m ('{name}'): walls lie up to half of that off",
+            remedy="move the objects next to the origin before the export, and the stations with them",
+        )
 
 
 def _points(placed: Placed) -> NDArray[np.float64]:

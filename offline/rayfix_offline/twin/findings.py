@@ -7,19 +7,19 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.scene.engine import FAR
 from rayfix_offline.scene.materials import ITU_MATERIALS, complex_permittivity, itu_name
 from rayfix_offline.scene.scene import METRES_PER_UNIT, Scene
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin.cleaning import Duplicates
 from rayfix_offline.twin.enclosures import Enclosures
+from rayfix_offline.twin.partitions import THICKNESS, Partitions
 from rayfix_offline.twin.solids import Part, touched
 
 LARGE_SCENE, SMALL_SCENE = 1000.0, 1.0
 """A scene larger or smaller than this probably has another unit, m."""
 
-COARSE = 0.005
-"""A table that holds positions no finer than this, m, is not built."""
+OPAQUE_ABOVE = 10.0
+"""Carrier frequency from which on thin partitions take much of a signal, GHz."""
 
 MOST_NAMES = 4
 
@@ -65,7 +65,7 @@ def error(kind: str, problem: str, remedy: str, *, station_id: str | None = None
 
 
 def size_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
-    """Check the scene's unit, upward axis and distance from the origin."""
+    """Check the scene's unit and upward axis."""
     extent = scene.bounds[1] - scene.bounds[0]
     size = " x ".join(f"{length:,.6g}" for length in extent)
     if extent.max() > LARGE_SCENE:
@@ -79,17 +79,6 @@ def size_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
             "upward axis",
             f"the scene is {size} m large and seems to lie on its side",
             f'if {other} points up, set scene_up = "{other}"',
-        )
-    distance = float(np.abs(scene.bounds).max())
-    if distance > FAR:
-        step = float(np.spacing(np.float32(distance)))
-        shift = ", ".join(f"{-v:.0f}" for v in np.round(scene.bounds.mean(axis=0)))
-        yield Finding(
-            severity="error" if step > COARSE else "warning",
-            kind="origin",
-            problem=f"the scene lies {distance / 1000.0:,.0f} km from its origin, where a table holds positions in "
-            f"steps of {step:.3g} m",
-            remedy=f"move scene and stations by ({shift}) m, and the answers back",
         )
 
 
@@ -178,15 +167,39 @@ def material_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
         )
 
 
+def partition_findings(site: SiteFile, scene: Scene, partitions: Partitions) -> Iterator[Finding]:
+    """Tell of thin walls, which are opaque here and not to signals of low frequencies."""
+    if site.propagation.carrier_ghz >= OPAQUE_ABOVE or not partitions.faces.any():
+        return
+    walls = [scene.objects[n] for n in np.unique(scene.face_objects[partitions.faces])]
+    yield warning(
+        "thin partition",
+        f"walls thinner than {THICKNESS:g} m, not known to be of concrete, brick or metal, divide the free space into "
+        f"{partitions.rooms} rooms: {_listed(walls)}; at {site.propagation.carrier_ghz:g} GHz signals pass thin "
+        "partitions, but rays pass no wall",
+        "leave thin partitions and doors out of the mesh, and name the material of walls of concrete, brick or metal",
+    )
+
+
 def station_findings(
-    site: SiteFile, scene: Scene, parts: Sequence[Part], enclosures: Enclosures, *, touch: float
+    site: SiteFile,
+    scene: Scene,
+    parts: Sequence[Part],
+    enclosures: Enclosures,
+    *,
+    touch: float,
+    origin: NDArray[np.float64],
 ) -> Iterator[Finding]:
-    """Find stations at impossible positions; one nearer than ``touch`` [m] to a surface lies on it."""
-    outside = _what_would_hold_stations(site, scene) or "correct position_m or scene_unit"
-    for s, station in enumerate(site.stations):
-        position = np.array(station.position_m)
+    """Find stations at impossible positions; one nearer than ``touch`` [m] to a surface lies on it.
+
+    Site and scene are in a frame whose origin, shape (3,), m, the findings add again.
+    """
+    given = site.moved(origin)
+    outside = _what_would_hold_stations(given, scene, origin) or "correct position_m or scene_unit"
+    for s, station in enumerate(given.stations):
+        position = np.array(site.stations[s].position_m)
         located = _located(station)
-        problem = _misplacement(position, scene, parts, enclosures, s, touch)
+        problem = _misplacement(position, scene, parts, enclosures, s, touch, origin)
         if problem is not None:
             where, remedy = problem
             yield error("station", f"{located} lies {where}", remedy or outside, station_id=station.id)
@@ -199,11 +212,14 @@ def _misplacement(
     enclosures: Enclosures,
     station: int,
     touch: float,
+    origin: NDArray[np.float64],
 ) -> tuple[str, str] | None:
     """Where a misplaced station lies, and the remedy, which is empty far from the scene; None for a valid position."""
     low, high = scene.bounds
     if np.any(position < low) or np.any(position > high):
-        box = " to ".join(f"({', '.join(f'{v:g}' for v in corner)})" for corner in (low, high))
+        box = " to ".join(
+            f"({', '.join(f'{v:.10g}' for v in np.round(corner, 6))})" for corner in (low + origin, high + origin)
+        )
         return f"outside the scene, which spans {box} m", ""
     face = touched(scene.triangles, position, touch=touch)
     if face >= 0:
@@ -217,20 +233,21 @@ def _misplacement(
     return None
 
 
-def _what_would_hold_stations(site: SiteFile, scene: Scene) -> str | None:
+def _what_would_hold_stations(site: SiteFile, scene: Scene, origin: NDArray[np.float64]) -> str | None:
     """Return the unit or the upward axis with which all stations would lie inside; None if they do, or with none."""
     positions = np.array([station.position_m for station in site.stations])
+    given = scene.bounds + origin
 
     def held(bounds: NDArray[np.float64]) -> bool:
         return bool(np.all((positions >= bounds[0]) & (positions <= bounds[1])))
 
     remedy = None
-    if not held(scene.bounds):
+    if not held(given):
         current = METRES_PER_UNIT[site.site.scene_unit]
-        units = [unit for unit, metres in METRES_PER_UNIT.items() if held(scene.bounds * metres / current)]
+        units = [unit for unit, metres in METRES_PER_UNIT.items() if held(given * metres / current)]
         if units:
             remedy = f'scene_unit = "{units[0]}"'
-        elif not scene.says_up and held(_turned(scene.bounds, site.site.scene_up)):
+        elif not scene.says_up and held(_turned(given, site.site.scene_up)):
             remedy = f'scene_up = "{_other_axis(site)}"'
     return remedy and f"set {remedy}: then all stations lie inside"
 
@@ -247,7 +264,7 @@ def _turned(bounds: NDArray[np.float64], up: str) -> NDArray[np.float64]:
 
 
 def _located(station: StationSection) -> str:
-    return f"station '{station.id}' at ({', '.join(f'{v:g}' for v in station.position_m)}) m"
+    return f"station '{station.id}' at ({', '.join(f'{v:.10g}' for v in station.position_m)}) m"
 
 
 def _names(parts: Sequence[Part]) -> str:

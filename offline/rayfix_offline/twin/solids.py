@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba
@@ -46,6 +46,11 @@ class Part:
     manifold: bool
     volume: float
     middle: tuple[float, float, float]
+
+    def moved(self, by: NDArray[np.float64]) -> "Part":
+        """Return the same part elsewhere, moved by a vector of shape (3,), m."""
+        x, y, z = (np.asarray(self.middle) + by).tolist()
+        return replace(self, middle=(x, y, z))
 
 
 def split_parts(mesh: Mesh) -> tuple[Part, ...]:

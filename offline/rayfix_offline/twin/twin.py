@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rayfix_offline.scene.engine import EmbreeEngine, RayEngine
+from rayfix_offline.scene.engine import FAR, EmbreeEngine, RayEngine
 from rayfix_offline.scene.scene import Scene, load_scene
 from rayfix_offline.site import SiteFile
 from rayfix_offline.twin.cleaning import find_duplicates
@@ -16,10 +17,12 @@ from rayfix_offline.twin.findings import (
     file_findings,
     material_findings,
     mesh_findings,
+    partition_findings,
     size_findings,
     station_findings,
 )
 from rayfix_offline.twin.mesh import Mesh
+from rayfix_offline.twin.partitions import find_partitions
 from rayfix_offline.twin.planes import Planes, merge_coplanar
 from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.solids import map_free_space, sealed_space, split_parts
@@ -30,9 +33,21 @@ from rayfix_tables.freespace import FreeSpace
 
 @dataclass(frozen=True, kw_only=True)
 class Twin:
-    """A scene prepared for ray launching."""
+    """A scene prepared for ray launching.
 
+    Attributes
+    ----------
+    site : SiteFile
+        Its stations in the frame of the scene below.
+    scene : Scene
+        In the frame of the table, which begins at the origin below.
+    origin : ndarray of shape (3,), m
+        In the frame of the scene file; zero but for scenes on map coordinates.
+    """
+
+    site: SiteFile
     scene: Scene
+    origin: NDArray[np.float64]
     planes: Planes
     engine: RayEngine
     free_space: FreeSpace
@@ -61,6 +76,8 @@ def prepare_twin(site: SiteFile, folder: Path, settings: TwinSettings | None = N
 def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = None) -> Twin:
     """Prepare the twin of a scene that is already loaded; see :func:`prepare_twin`."""
     settings = settings or TwinSettings()
+    origin = table_origin(scene)
+    site, scene = site.moved(-origin), scene.moved(-origin)
     mesh = Mesh(scene=scene, weld=settings.weld)
     duplicates = find_duplicates(mesh)
     mesh = mesh.without(duplicates.redundant)
@@ -81,22 +98,38 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
     findings = [
         *size_findings(site, scene),
         *file_findings(scene),
-        *mesh_findings(scene, duplicates, parts, enclosures),
+        *mesh_findings(scene, duplicates, [part.moved(origin) for part in parts], enclosures),
         *material_findings(site, scene),
-        *station_findings(site, scene, parts, enclosures, touch=settings.touch),
+        *partition_findings(site, scene, find_partitions(scene, free_space, closed=closed)),
+        *station_findings(site, scene, parts, enclosures, touch=settings.touch, origin=origin),
     ]
     if not free_space.free.any():
         problem = "the scene has no free space: every voxel lies in a solid or outside"
         findings.append(error("free space", problem, "check for an inverted room"))
     planes = merge_coplanar(scene.triangles, tolerance=settings.plane_tolerance, rounding=settings.plane_rounding)
     return Twin(
+        site=site,
         scene=scene,
+        origin=origin,
         planes=join_facets(mesh, planes, surface_angle=settings.surface_angle, facet_size=settings.facet_size),
         engine=EmbreeEngine(scene.triangles),
         free_space=free_space,
         closed=closed,
         findings=tuple(findings),
     )
+
+
+def table_origin(scene: Scene) -> NDArray[np.float64]:
+    """Origin of the table's frame, shape (3,), m: zero, or the middle of a scene that lies far off, in whole metres.
+
+    It is zero also along axes on which the middle lies nearer to zero than the scene is large. Along the others the
+    scene's coordinates are within a factor of 2 of it, so that subtracting and adding it is exact.
+    """
+    low, high = scene.bounds
+    if np.abs(scene.bounds).max() <= FAR:
+        return np.zeros(3)
+    middle = np.round(0.5 * (low + high))
+    return np.where(np.abs(middle) > high - low, middle, 0.0)
 
 
 def refuse_errors(twin: Twin) -> None:

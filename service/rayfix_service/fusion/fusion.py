@@ -74,8 +74,10 @@ class Fusion:
             When it was stopped.
         """
         sorted_report = sort_report(report, self.table.site)
-        free_space = self.table.scene.free_space
-        prior = self._uniform_prior if report.height is None else height_prior(report.height, free_space)
+        prior = self._uniform_prior
+        if report.height is not None:
+            scene = self.table.scene
+            prior = height_prior(report.height, scene.free_space).raised(-float(scene.origin[2]))
         unused = dict(sorted_report.unused)
         observations, factors = self._factors(sorted_report, prior, unused, stop)
         hypotheses = None

@@ -1,6 +1,6 @@
 """The state of a target's track after a report."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -55,3 +55,10 @@ class TrackedPosition:
     num_reports: int
     estimate: Estimate
     regions: "CredibleRegions"
+
+    def moved(self, by: NDArray[np.float64]) -> "TrackedPosition":
+        """Return the same track elsewhere, moved by a vector of shape (3,), m."""
+        if not by.any():
+            return self
+        moved = replace(self.estimate, position=self.estimate.position + by)
+        return replace(self, estimate=moved, regions=self.regions.moved(by))

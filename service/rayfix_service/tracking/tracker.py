@@ -23,7 +23,8 @@ from rayfix_service.tracking.settings import TrackingSettings
 from rayfix_service.tracking.track import TrackedPosition, TrackState
 from rayfix_service.tracking.walls import walls_of
 from rayfix_tables.errors import ReportError
-from rayfix_tables.table import Scene, Table
+from rayfix_tables.scene import Scene
+from rayfix_tables.table import Table
 
 _MOST_HYPOTHESES = 512
 """Of a report, the best are taken in: each meets all particles, and few reports have a quarter as many."""
@@ -56,6 +57,8 @@ class Tracker:
 
     docs/tracking.md describes the filter.
 
+    Particles are in the table's frame, as hypotheses are; the positions that it gives are in the scene's.
+
     Parameters
     ----------
     table : Table or Scene
@@ -74,7 +77,9 @@ class Tracker:
         self, table: Table | Scene, settings: TrackingSettings | None = None, *, clock: Callable[[], float] = monotonic
     ) -> None:
         self.settings = settings or TrackingSettings()
-        self._walls = walls_of(table.scene if isinstance(table, Table) else table)
+        scene = table.scene if isinstance(table, Table) else table
+        self._walls = walls_of(scene.in_table_frame)
+        self._origin = scene.origin
         self.dropped = 0
         self._clock = clock
         self._tracks: OrderedDict[str, _Track] = OrderedDict()  # the one with the latest report comes last
@@ -169,7 +174,7 @@ class Tracker:
         particles = self._newborn(fused, rng)
         if particles is None:
             return None
-        position = _tracked(state, timestamp, 1, particles)
+        position = _tracked(state, timestamp, 1, particles).moved(self._origin)
         return _Track(particles=particles, position=position, seconds=seconds, touched=now, rng=rng)
 
     def _newborn(self, fused: Fused, rng: np.random.Generator) -> Particles | None:
@@ -194,7 +199,7 @@ class Tracker:
         if particles is None:
             return None
         num_reports = 1 if state == "restarted" else track.position.num_reports + (state == "updated")
-        position = _tracked(state, timestamp, num_reports, particles)
+        position = _tracked(state, timestamp, num_reports, particles).moved(self._origin)
         return _Track(particles=particles, position=position, seconds=track.seconds + gap, touched=now, rng=rng)
 
     def _take_in(

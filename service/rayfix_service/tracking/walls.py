@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.table import Scene
+from rayfix_tables.scene import Scene
 
 _CELL = 0.5
 """Side of a cell, m: about as far as a target goes between two reports."""

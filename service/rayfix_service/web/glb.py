@@ -3,7 +3,8 @@
 glTF 2.0, https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. Its y axis points up and the scene frame's z axis
 does, so the file has one root node, named after the site, whose rotation stands the scene upright; the vertices below
 are in the scene frame, moved to its middle, which a second node moves back: so single precision is exact to a fraction
-of a millimetre in sites that lie far from their origin.
+of a millimetre in sites that lie far from their origin. ``origin_m`` among the asset's extras is where they count from,
+in the scene frame: programs that hold the places of nodes in single precision draw relative to it.
 """
 
 import json
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.table import Scene
+from rayfix_tables.scene import Scene
 
 MEDIA_TYPE = "model/gltf-binary"
 
@@ -88,7 +89,7 @@ def write_glb(scene: Scene, name: str) -> bytes:
         offset = views[-1]["byteOffset"] + views[-1]["byteLength"]
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": faces.nbytes, "target": _INDICES})
     document = {
-        "asset": {"version": "2.0", "generator": "rayfix"},
+        "asset": {"version": "2.0", "generator": "rayfix", "extras": {"origin_m": middle.tolist()}},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [

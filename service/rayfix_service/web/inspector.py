@@ -9,7 +9,7 @@ from rayfix_service.fusion.lookup.lookup import look_up
 from rayfix_service.fusion.measurements.directions import Direction, in_field_of_view
 from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_tables.level import Level
-from rayfix_tables.table import StationPart
+from rayfix_tables.part import StationPart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,9 @@ class DirectionView:
     by_reflections: NDArray[np.float64]
 
 
-def view_direction(part: StationPart, azimuth: float, zenith: float, stdev: float, *, limit: int) -> DirectionView:
+def view_direction(
+    part: StationPart, azimuth: float, zenith: float, stdev: float, *, limit: int, origin: NDArray[np.float64]
+) -> DirectionView:
     """Look a direction up and condition its components on it.
 
     Parameters
@@ -70,6 +72,8 @@ def view_direction(part: StationPart, azimuth: float, zenith: float, stdev: floa
         Of both angles.
     limit : int
         Components that are returned, the most probable ones.
+    origin : ndarray of shape (3,), m
+        Of the table's frame in the scene's, in which positions are returned.
     """
     measured = Direction(azimuth=azimuth, zenith=zenith, cov=np.diag([stdev**2, stdev**2]))
     lookup = look_up(part.levels, measured)
@@ -90,7 +94,7 @@ def view_direction(part: StationPart, azimuth: float, zenith: float, stdev: floa
         cell_components=ends - begins,
         log_evidence=log_evidence,
         probability=fraction[top],
-        position=mixture.mean[top, :3],
+        position=mixture.mean[top, :3] + origin,
         position_cov=mixture.cov[top, :3, :3],
         path_length=mixture.mean[top, 3],
         path_length_stdev=np.sqrt(mixture.cov[top, 3, 3]),

@@ -21,7 +21,8 @@ from rayfix_service.http.routes.dependencies import ServicesDep, TableDep
 from rayfix_service.web.documents import CoverageDocument, MixtureDocument, mixture_document
 from rayfix_service.web.glb import MEDIA_TYPE, write_glb
 from rayfix_service.web.inspector import mass_by_reflections, view_direction
-from rayfix_tables.table import StationPart, Table
+from rayfix_tables.part import StationPart
+from rayfix_tables.table import Table
 
 router = APIRouter(prefix="/v1", tags=["viewer"])
 
@@ -72,12 +73,15 @@ async def get_mixture(
 
     It counts as a report for the rate limit.
     """
-    part = _part(served.locator.table, station_id)
+    table = served.locator.table
+    part = _part(table, station_id)
     azimuth = math.remainder(math.radians(azimuth_deg), 2.0 * math.pi)
     zenith, stdev = math.radians(zenith_deg), math.radians(stdev_deg)
 
     def view() -> dict[str, Any]:
-        return mixture_document(station_id, view_direction(part, azimuth, zenith, stdev, limit=limit))
+        return mixture_document(
+            station_id, view_direction(part, azimuth, zenith, stdev, limit=limit, origin=table.scene.origin)
+        )
 
     charge_report(request)
     return JSONResponse(await services.slow_work.run(view))

@@ -16,7 +16,8 @@ from rayfix_tables.angles import wrap
 from rayfix_tables.errors import ReportError
 from rayfix_tables.gaussians.definite import is_definite
 from rayfix_tables.mixture import joint_cov
-from rayfix_tables.table import StationPart, Table
+from rayfix_tables.part import StationPart
+from rayfix_tables.table import Table
 
 Kind = Literal["aoa", "pt", "toa", "tdoa"]
 
@@ -58,6 +59,7 @@ def find_path(part: StationPart, position: NDArray[np.float64]) -> SimulatedPath
     ----------
     part : StationPart
     position : ndarray of shape (3,), m
+        In the table's frame.
     """
     level = part.levels[0]
     mixture = level.mixture
@@ -136,7 +138,8 @@ def simulate(
             f"position ({x:.2f}, {y:.2f}, {z:.2f}) is in a solid or outside; give one in the free space",
             path=("position",),
         )
-    paths = [path for part in table.parts.values() if (path := find_path(part, point)) is not None]
+    local = point - table.scene.origin
+    paths = [path for part in table.parts.values() if (path := find_path(part, local)) is not None]
     if not paths:
         raise ReportError(
             f"no path reaches a station from position ({x:.2f}, {y:.2f}, {z:.2f}); give one that rays reach",

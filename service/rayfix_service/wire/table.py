@@ -1,6 +1,7 @@
 """A table and its stations as JSON."""
 
 import math
+from typing import Annotated
 
 from pydantic import BaseModel, Field
 
@@ -26,6 +27,9 @@ class TableSummary(BaseModel):
     format_version: int
     software_version: str = Field(description="version of rayfix that built the table")
     site: SiteSummary
+    origin_m: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
+        description="where coordinates in the table's file count from, in the scene frame; answers are in the latter"
+    )
     num_stations: int
     num_components: int = Field(description="Gaussian components over all stations and levels")
 
@@ -69,6 +73,7 @@ def table_summary(name: str, table: Table) -> TableSummary:
             north_deg=_degrees(table.site.north),
             max_path_length_m=table.site.max_path_length,
         ),
+        origin_m=table.scene.origin.tolist(),
         num_stations=len(stations),
         num_components=sum(level.num_components for s in stations for level in table.levels(s.id)),
     )

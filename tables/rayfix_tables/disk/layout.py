@@ -18,7 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.disk.files import OpenFile
-from rayfix_tables.disk.schema import CELL_CHANGE, FORMAT, FORMAT_VERSION, LEVEL_DATASETS, LOG_BALANCE, SCENE_DATASETS
+from rayfix_tables.disk.schema import (
+    CELL_CHANGE,
+    FORMAT,
+    FORMAT_VERSION,
+    LEVEL_DATASETS,
+    LOG_BALANCE,
+    READ_VERSIONS,
+    SCENE_DATASETS,
+    TEXT_DATASETS,
+)
 from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError, TableError
 
 _MOST_ATTRIBUTES = 64  # of one object; a station has 14
@@ -26,6 +35,7 @@ _LEAST_OBJECT_BYTES = 16
 _LONGEST_ARRAY = 1024  # of an attribute; the coverage of a station is the longest
 _STATION = re.compile(r"stations/[^/]+\Z")
 _LEVEL = re.compile(r"stations/[^/]+/levels/(0|[1-9][0-9]{0,3})\Z")
+_OF_SCENE = {**SCENE_DATASETS, **TEXT_DATASETS}
 _OF_LEVELS = {**LEVEL_DATASETS, "log_balance": LOG_BALANCE, "cell_change": CELL_CHANGE}
 
 
@@ -48,8 +58,8 @@ class StoredArray:
 class FileLayout:
     """The groups, attributes and datasets of a table's file, by their paths; that of the root is ``""``."""
 
-    attributes: dict[str, dict[str, Any]]
-    datasets: dict[str, StoredArray]
+    attributes: dict[str, dict[str, Any]] = field(default_factory=dict)
+    datasets: dict[str, StoredArray] = field(default_factory=dict)
 
     def to_document(self) -> dict[str, Any]:
         """Return the layout as JSON-compatible data."""
@@ -84,8 +94,8 @@ def dataset_kind(path: str) -> tuple[np.dtype[Any], int]:
         When a table has no such dataset.
     """
     group, _, name = path.rpartition("/")
-    if path in SCENE_DATASETS:
-        kind = SCENE_DATASETS[path]
+    if path in _OF_SCENE:
+        kind = _OF_SCENE[path]
     elif _LEVEL.match(group) and name in _OF_LEVELS:
         kind = _OF_LEVELS[name]
     else:
@@ -103,7 +113,8 @@ def damage_reported(path: Path) -> Iterator[None]:
     """Say in one line what the readers make of a damaged file.
 
     A byte changed among the file's own administration shows as any of these: HDF5 raises OSError, KeyError or
-    RuntimeError, and what it reads nevertheless may have any type.
+    RuntimeError, and the readers check the type of what it reads nevertheless. A TypeError or an AttributeError is a
+    defect of the readers and goes on as such.
     """
     try:
         yield
@@ -112,16 +123,7 @@ def damage_reported(path: Path) -> Iterator[None]:
         raise TableError(
             f"{path} cannot be read: there is not enough memory for it; free some, or use a larger machine"
         ) from error
-    except (
-        ArithmeticError,
-        AttributeError,
-        LookupError,
-        OSError,
-        RuntimeError,
-        SystemError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except (KeyError, OSError, OverflowError, RuntimeError, SystemError, ValueError) as error:
         raise CorruptTableError(
             f"{path} is damaged: {_one_line(error)}; restore it from a copy or build it again"
         ) from error
@@ -145,17 +147,19 @@ def read_layout(opened: OpenFile) -> FileLayout:
     path = opened.path
     # By its descriptor: another file may have its name by now.
     with h5py.File(f"/dev/fd/{opened.descriptor}", "r") as file:
-        reader = _Reader(size=opened.size)
+        # Texts in a heap may keep HDF5 busy for ever, so that files of this version must not have any.
+        reader = _Reader(size=opened.size, in_heaps=_whole_number(file, "format_version") != FORMAT_VERSION)
         root = reader.attributes_of(file.id, "")
         if root.get("format") != FORMAT:
             raise NotATableError(
                 f"{path} is an HDF5 file but not a rayfix table; give a file that 'rayfix build' wrote"
             )
         version = root.get("format_version")
-        if version != FORMAT_VERSION or isinstance(version, bool):
+        if version not in READ_VERSIONS or isinstance(version, bool):
             raise FormatVersionError(
-                f"{path} has table format {version}, this rayfix reads format {FORMAT_VERSION}; build the table again "
-                "with this version, or install the version that wrote it"
+                f"{path} has table format {version}, this rayfix reads formats "
+                f"{' and '.join(str(each) for each in READ_VERSIONS)}; build the table again with this version, or "
+                "install the version that wrote it"
             )
         reader.read_group(file["/"].id, "")
         return FileLayout(attributes=reader.attributes, datasets=reader.datasets)
@@ -169,9 +173,12 @@ class _Reader:
     ----------
     size : int
         Of the file, bytes; what the objects say that they hold must not be more.
+    in_heaps : bool
+        Whether texts may be of variable length.
     """
 
     size: int
+    in_heaps: bool
     attributes: dict[str, dict[str, Any]] = field(default_factory=dict)
     datasets: dict[str, StoredArray] = field(default_factory=dict)
     _array_bytes: int = 0
@@ -225,7 +232,7 @@ class _Reader:
             raise ValueError(f"{path} is no array")
         shape = tuple(int(length) for length in space.get_simple_extent_dims())
         if not dataset.get_type().equal(h5py.h5t.py_create(dtype)) or len(shape) != ndim:
-            raise ValueError(f"{path} is {dataset.dtype} with {len(shape)} axes, not {dtype} with {ndim}")
+            raise ValueError(f"{path} is {_type_of(dataset)} with {len(shape)} axes, not {dtype} with {ndim}")
         num_bytes = math.prod(shape) * dtype.itemsize
         offset = dataset.get_offset() if num_bytes else 0
         self._array_bytes += num_bytes
@@ -250,7 +257,7 @@ class _Reader:
 
     def _value(self, attribute: h5py.h5a.AttrID, name: str) -> Any:
         kind, space = attribute.get_type(), attribute.get_space()
-        is_text = isinstance(kind, h5py.h5t.TypeStringID) and kind.is_variable_str()
+        is_text = isinstance(kind, h5py.h5t.TypeStringID) and (self.in_heaps or not kind.is_variable_str())
         is_number = isinstance(kind, h5py.h5t.TypeIntegerID | h5py.h5t.TypeFloatID) and kind.get_size() <= 8
         extent = space.get_simple_extent_type()
         scalar = extent == h5py.h5s.SCALAR
@@ -265,11 +272,32 @@ class _Reader:
             if self._text_bytes > self.size:
                 raise ValueError(f"{shown(name)} is too long")
             return text
-        values = np.empty(attribute.shape, attribute.dtype)
+        values = np.empty(attribute.shape, _type_of(attribute))
         attribute.read(values)
         if not np.all(np.isfinite(values)):
             raise ValueError(f"{shown(name)} is not finite")
         return values.tolist()
+
+
+def _whole_number(file: h5py.File, name: str) -> int | None:
+    """Value of an attribute of the file that is one whole number; None where it is anything else."""
+    if not h5py.h5a.exists(file.id, name.encode()):
+        return None
+    attribute = h5py.h5a.open(file.id, name.encode())
+    if not isinstance(attribute.get_type(), h5py.h5t.TypeIntegerID) or attribute.shape != ():
+        return None
+    value = np.empty((), _type_of(attribute))
+    attribute.read(value)
+    return int(value)
+
+
+def _type_of(identifier: Any) -> np.dtype[Any]:
+    """Type of an attribute or a dataset."""
+    try:
+        dtype: np.dtype[Any] = identifier.dtype
+    except TypeError as error:  # h5py's own, of types that NumPy does not have
+        raise ValueError(str(error)) from error
+    return dtype
 
 
 def _is_group(path: str) -> bool:
@@ -284,7 +312,7 @@ def _is_group(path: str) -> bool:
 
 def _text(attribute: h5py.h5a.AttrID) -> str:
     """Text of an attribute. One that is not Unicode cannot be written into answers."""
-    values = np.empty((), attribute.dtype)
+    values = np.empty((), _type_of(attribute))
     attribute.read(values)
     value: Any = values[()]
     return value.decode("utf-8") if isinstance(value, bytes) else str(value).encode("utf-8").decode("utf-8")

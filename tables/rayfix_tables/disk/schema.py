@@ -13,7 +13,19 @@ from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
 from rayfix_tables.site import NO_BIAS, StationBias
 
 FORMAT = "rayfix-table"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""Version that is written."""
+
+TEXT_IN_HEAPS = 1
+"""Version whose texts are attributes of variable length, in a heap of the file; it is read, too."""
+
+READ_VERSIONS = (TEXT_IN_HEAPS, FORMAT_VERSION)
+
+ARRAYS_VERSION = 1
+"""Version of what a part's arrays say: both versions of the format have the same, so that parts can be taken over."""
+
+TEXT_DATASETS: dict[str, tuple[type[np.generic], int]] = {"site": (np.uint8, 1), "scene/materials": (np.uint8, 1)}
+"""Type and number of axes of the datasets that hold JSON, in UTF-8."""
 
 SCENE_DATASETS: dict[str, tuple[type[np.generic], int]] = {
     "scene/vertices_m": (np.float64, 2),
@@ -55,16 +67,35 @@ def bias_attributes(bias: StationBias) -> dict[str, float]:
 
 
 def read_bias(attributes: Mapping[str, Any]) -> StationBias:
-    """Bias of a station from the attributes of its group; tables without them are of stations without a bias."""
-    metres_and_degrees = [float(attributes.get(name, 0.0)) for name in bias_attributes(NO_BIAS)]
+    """Bias of a station from the attributes of its group; tables without them are of stations without a bias.
+
+    Raises
+    ------
+    ValueError
+        When one of them is no number.
+    """
+    metres_and_degrees = [attributes.get(name, 0.0) for name in bias_attributes(NO_BIAS)]
+    if not all(isinstance(value, int | float) for value in metres_and_degrees):
+        raise ValueError("the bias of a station is no number")
     azimuth, zenith, angle_stdev = (float(angle) for angle in np.deg2rad(metres_and_degrees[2:]))
     return StationBias(
-        range=metres_and_degrees[0],
-        range_stdev=metres_and_degrees[1],
+        range=float(metres_and_degrees[0]),
+        range_stdev=float(metres_and_degrees[1]),
         azimuth=azimuth,
         zenith=zenith,
         angle_stdev=angle_stdev,
     )
+
+
+def write_text(node: h5py.Group | h5py.Dataset, name: str, text: str) -> None:
+    """Write an attribute that is a text of fixed length: it lies in the object itself and not in a heap."""
+    raw = text.encode()
+    node.attrs.create(name, raw, dtype=h5py.string_dtype("utf-8", max(1, len(raw))))
+
+
+def read_text(node: h5py.Group | h5py.Dataset, name: str) -> str:
+    """Read an attribute that is a text, of fixed or of variable length."""
+    return str(_plain(node.attrs[name]))
 
 
 def array_digest(array: NDArray[Any]) -> str:
@@ -93,14 +124,14 @@ def content_attributes(file: h5py.File) -> dict[str, Any]:
     gathered: dict[str, dict[str, Any]] = {"": dict(file.attrs)}
     file.visititems(lambda name, node: gathered.update({name: dict(node.attrs)}))
     return content_of(
-        {
-            path: {
-                key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-                for key, value in attributes.items()
-            }
-            for path, attributes in gathered.items()
-        }
+        {path: {key: _plain(value) for key, value in attributes.items()} for path, attributes in gathered.items()}
     )
+
+
+def _plain(value: Any) -> Any:
+    """Return an attribute as JSON-compatible data."""
+    value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    return value.decode() if isinstance(value, bytes) else value
 
 
 def content_of(attributes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -112,7 +143,8 @@ def content_of(attributes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         if path and key != "sha256"
     }
     for key in ("format", "format_version", "site", "scene_sha256"):
-        found[f"@{key}"] = str(attributes[""].get(key))
+        if key in attributes[""]:  # the site is a dataset since version 2
+            found[f"@{key}"] = str(attributes[""][key])
     return found
 
 

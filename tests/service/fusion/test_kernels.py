@@ -31,8 +31,8 @@ from rayfix_tables.gaussians.triangles import triangle
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture, pack, unpack
+from rayfix_tables.part import StationPart
 from rayfix_tables.site import Station
-from rayfix_tables.table import StationPart
 from tests.support import kernel_twins
 
 Array = NDArray[np.float64]

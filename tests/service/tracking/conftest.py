@@ -20,7 +20,7 @@ from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import Prior, uniform_prior
 from rayfix_service.tracking.likelihood import Likelihood, likelihood_of
 from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.table import Scene
+from rayfix_tables.scene import Scene
 
 Array = NDArray[np.float64]
 

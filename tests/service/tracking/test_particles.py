@@ -18,7 +18,7 @@ from rayfix_service.tracking.motion import MotionModel
 from rayfix_service.tracking.particles import Particles, Updated, birth, mixed, predict, update
 from rayfix_service.tracking.walls import walls_of
 from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.table import Scene
+from rayfix_tables.scene import Scene
 
 COUNT = 20_000
 MODEL = MotionModel(acceleration_density=0.5, vertical_acceleration_density=0.5)

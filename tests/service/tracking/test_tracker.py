@@ -15,7 +15,7 @@ from rayfix_service.tracking.settings import TrackingSettings
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.tracking.tracker import Tracker
 from rayfix_tables.errors import ReportError
-from rayfix_tables.table import Scene
+from rayfix_tables.scene import Scene
 
 Send = Callable[..., TrackedPosition | None]
 

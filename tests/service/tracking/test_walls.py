@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.tracking.walls import walls_of
 from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.table import Scene
+from rayfix_tables.scene import Scene
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,8 @@ from rayfix_service.wire import FixDocument, parse_report
 from rayfix_tables.errors import ReportError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.mixture import TubeMixture
-from rayfix_tables.table import Scene, Table
+from rayfix_tables.scene import Scene
+from rayfix_tables.table import Table
 from tests.support.running_app import RunningApp
 
 DEGREE = math.pi / 180.0
@@ -109,9 +110,11 @@ def test_the_mixture_of_a_direction_is_what_the_fusion_uses(web: RunningApp, tab
 
 def test_the_level_follows_the_deviation(table: Table):
     part = table.parts["bs1"]
-    windows = [view_direction(part, 1.0, 1.7, s * DEGREE, limit=8).window for s in (0.5, 1.9, 7.9)]
+    windows = [
+        view_direction(part, 1.0, 1.7, s * DEGREE, limit=8, origin=table.scene.origin).window for s in (0.5, 1.9, 7.9)
+    ]
     np.testing.assert_allclose(windows, np.deg2rad([2.5, 2.5, 10.0]))
-    assert len(view_direction(part, 1.0, 1.7, 30.0 * DEGREE, limit=8).cells) > 1
+    assert len(view_direction(part, 1.0, 1.7, 30.0 * DEGREE, limit=8, origin=table.scene.origin).cells) > 1
 
 
 def test_a_direction_without_rays_is_empty(table: Table):
@@ -122,7 +125,9 @@ def test_a_direction_without_rays_is_empty(table: Table):
         cell_log_mass=np.full(level.num_cells, -np.inf),
         mixture=TubeMixture.empty(),
     )
-    view = view_direction(replace(table.parts["bs1"], levels=(bare,)), 1.0, 1.7, DEGREE, limit=8)
+    view = view_direction(
+        replace(table.parts["bs1"], levels=(bare,)), 1.0, 1.7, DEGREE, limit=8, origin=table.scene.origin
+    )
     document = mixture_document("bs1", view)
     MixtureDocument.model_validate(document)
     assert document["components"] == []

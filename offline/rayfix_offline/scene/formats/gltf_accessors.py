@@ -16,7 +16,11 @@ COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 DRACO = "KHR_draco_mesh_compression"
-MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+MESHOPT = {
+    "EXT_meshopt_compression": "gltf-transform copy in.glb out.glb",
+    "KHR_meshopt_compression": "gltfpack -noq -kn -km -i in.glb -o out.glb",
+}
+"""Compression that is not read, and a command that takes it off: gltf-transform does not know the younger one."""
 
 _MOST = 200_000_000
 """Values of an accessor that has none in the file, but is sparse."""
@@ -157,7 +161,7 @@ class Accessors:
         if compressed and not self._is_there(buffer):
             self.refuse(
                 f"its geometry is compressed with {compressed[0]}, which is not supported",
-                "decompress it, for example with: gltf-transform copy in.glb out.glb",
+                f"decompress it, for example with: {MESHOPT[compressed[0]]}",
             )
         data = self._buffer(buffer)
         start = self.whole(view, "byteOffset", where, 0)

@@ -6,7 +6,7 @@ Where the best candidate is less probable than p, the region reaches to its riva
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numba
@@ -66,6 +66,10 @@ class CredibleRegions:
     covariance: NDArray[np.float64]
     points: Points
     share: float
+
+    def moved(self, by: NDArray[np.float64]) -> "CredibleRegions":
+        """Return the same regions elsewhere, moved by a vector of shape (3,), m."""
+        return replace(self, position=self.position + by, points=self.points.moved(by))
 
     def accuracies(self, probability: float) -> "Accuracies":
         """Circle, layer and ellipsoid that each hold the UE with a probability, in one go."""

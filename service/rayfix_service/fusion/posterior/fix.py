@@ -3,7 +3,7 @@
 The JSON of the HTTP interface is written by :mod:`rayfix_service.wire`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -87,6 +87,13 @@ class Fix:
     simplified: tuple[str, ...] = ()
     target_id: str | None = None
     timestamp: str | None = None
+
+    def moved(self, by: NDArray[np.float64]) -> "Fix":
+        """Return the same fix elsewhere, moved by a vector of shape (3,), m."""
+        if not by.any():
+            return self
+        candidates = tuple(replace(each, position=each.position + by) for each in self.candidates)
+        return replace(self, candidates=candidates, regions=self.regions and self.regions.moved(by))
 
     @property
     def position(self) -> NDArray[np.float64] | None:

@@ -52,7 +52,8 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
     product : Product
         Of the report.
     table : Table
-        Of the same site; its free space is what the hypotheses are cut to.
+        Of the same site; its free space is what the hypotheses are cut to. They are in its frame, the fix in the
+        scene's.
     settings : FusionSettings
     stop : Stop
         Ends it early.
@@ -71,7 +72,7 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
         found = outlier_index(product.observations)
         summary = None
         if len(hypotheses):
-            summary = sum_up(hypotheses, found, table.scene.free_space, settings.hypothesis_floor, stop)
+            summary = sum_up(hypotheses, found, table.scene.free_space_in_table_frame, settings.hypothesis_floor, stop)
         if summary is None or not len(summary.probability):
             log_evidence, status = hypotheses.log_all_outlier, "inconsistent"
             outlier = dict.fromkeys(found.places, 1.0)
@@ -108,7 +109,7 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
         table_id=table.table_id,
         target_id=report.target_id,
         timestamp=report.timestamp,
-    )
+    ).moved(table.scene.origin)
 
 
 def _status(candidates: tuple[Candidate, ...], half_bad: float, settings: FusionSettings) -> Status:

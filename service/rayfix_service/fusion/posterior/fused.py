@@ -18,7 +18,8 @@ class Fused:
     ----------
     fix : Fix
     hypotheses : Hypotheses or None
-        Of the position, not yet cut to the free space; None where no measurement could be used.
+        Of the position, not yet cut to the free space; None where no measurement could be used. In the table's frame,
+        as the prior.
     prior : Prior
         Of the position, with which the hypotheses' Gaussians are multiplied.
     """

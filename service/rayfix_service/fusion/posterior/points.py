@@ -4,7 +4,7 @@ The thousand of a fix are 25 kB, and most fixes never need them. A fix keeps the
 from and, for each point of a fixed standard normal, the Gaussian that it belongs to.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numba
@@ -25,6 +25,9 @@ class Points(Protocol):
     def places(self) -> NDArray[np.float64]:
         """Where they are, shape (k, 3), m."""
 
+    def moved(self, by: NDArray[np.float64]) -> "Points":
+        """Return the same points elsewhere, moved by a vector of shape (3,), m."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ListedPoints:
@@ -40,6 +43,10 @@ class ListedPoints:
     def places(self) -> NDArray[np.float64]:
         """Where they are, shape (k, 3), m."""
         return self.position
+
+    def moved(self, by: NDArray[np.float64]) -> "ListedPoints":
+        """Return the same points elsewhere, moved by a vector of shape (3,), m."""
+        return ListedPoints(position=self.position + by)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,6 +71,10 @@ class DrawnPoints:
     def places(self) -> NDArray[np.float64]:
         """Where they are, shape (k, 3), m."""
         return np.asarray(_places(self.mean, self.root, self.owner, normal_points(len(self.owner))).T)
+
+    def moved(self, by: NDArray[np.float64]) -> "DrawnPoints":
+        """Return the same points elsewhere, moved by a vector of shape (3,), m."""
+        return replace(self, mean=self.mean + by)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -6,7 +6,7 @@ the prior. Only the free fraction of each Gaussian is approximated, by points.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,6 +57,17 @@ class Posterior:
     prior: Prior
     free_space: FreeSpace
     log_evidence: float
+
+    def moved(self, by: Array) -> "Posterior":
+        """Return the same density elsewhere, moved by a vector of shape (3,), m."""
+        if not by.any():
+            return self
+        return replace(
+            self,
+            mean=self.mean + by,
+            prior=self.prior.raised(float(by[2])),
+            free_space=self.free_space.moved(by),
+        )
 
     def log_density(self, points: ArrayLike) -> Array:
         """Natural logarithm of the density at points.

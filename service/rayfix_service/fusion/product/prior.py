@@ -36,6 +36,14 @@ class Prior(NamedTuple):
     precision: float = 0.0
     eta: float = 0.0
 
+    def raised(self, by: float) -> "Prior":
+        """Return the prior of a place that lies higher by so much, m: of ``z + by``."""
+        return Prior(
+            log_volume=self.log_volume + self.eta * by + 0.5 * self.precision * by**2,
+            precision=self.precision,
+            eta=self.eta + self.precision * by,
+        )
+
 
 def uniform_prior(free_space: FreeSpace) -> Prior:
     """Prior of a UE of unknown height."""

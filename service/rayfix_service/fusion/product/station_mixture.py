@@ -15,7 +15,7 @@ from rayfix_service.fusion.measurements.line_of_sight import LineOfSightWeights
 from rayfix_service.fusion.product.merging import merge_gaussians
 from rayfix_tables.gaussians.conditioning import Conditioned, MeasuredCells, condition_on_angle
 from rayfix_tables.mixture import Tubes
-from rayfix_tables.table import StationPart
+from rayfix_tables.part import StationPart
 
 _RANGE_STDEV = 0.1
 """Noise of path lengths, m, under which paths of all directions are compared."""

@@ -154,10 +154,13 @@ def test_damaged_draco(tmp_path: Path) -> None:
     assert "KHR_draco_mesh_compression cannot be decoded" in message
 
 
-def test_meshopt_is_refused_by_name(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("extension", "tool"), [("EXT_meshopt_compression", "gltf-transform copy"), ("KHR_meshopt_compression", "gltfpack")]
+)
+def test_meshopt_is_refused_by_name(extension: str, tool: str, tmp_path: Path) -> None:
     file = one_box()
     for view in file.document["bufferViews"]:
-        view["extensions"] = {"EXT_meshopt_compression": {"buffer": 0, "byteLength": 1, "byteStride": 12, "count": 8}}
+        view["extensions"] = {extension: {"buffer": 0, "byteLength": 1, "byteStride": 12, "count": 8}}
     assert_is_the_box(file.write(tmp_path / "plain.glb"))
     document = json.loads(json.dumps(file.document))
     document["buffers"] = [{"byteLength": 1, "uri": "data:application/octet-stream;base64,AA=="}, {"byteLength": 999}]
@@ -165,8 +168,8 @@ def test_meshopt_is_refused_by_name(tmp_path: Path) -> None:
         view["buffer"] = 1
     (tmp_path / "a.gltf").write_text(json.dumps(document))
     message = refusal(SceneError, load_scene, tmp_path / "a.gltf")
-    assert "EXT_meshopt_compression, which is not supported" in message
-    assert "gltf-transform copy" in message
+    assert f"its geometry is compressed with {extension}, which is not supported" in message
+    assert f"decompress it, for example with: {tool} " in message
 
 
 @pytest.mark.parametrize("where", ["node", "mesh", "primitive", "file"])

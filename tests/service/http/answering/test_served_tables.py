@@ -1,7 +1,6 @@
 """Tables in operation: several of a folder, new ones swapped in, bad ones refused."""
 
 import asyncio
-import json
 import os
 import shutil
 from collections.abc import Iterator
@@ -12,11 +11,11 @@ import h5py
 import pytest
 
 from rayfix_service.server.server import serve
-from rayfix_tables.disk.schema import content_attributes, content_id, dataset_paths
 from rayfix_tables.errors import TableError
 from tests.support.damage import flip_a_bit
 from tests.support.reports import REPORT
 from tests.support.running_app import RunningApp
+from tests.support.table_edits import change_site, sign
 
 POLL = 0.05  # s
 
@@ -25,9 +24,8 @@ def put_table(source: Path, path: Path, site_name: str) -> str:
     """Rename a copy of a table with another name of the site into place; returns its identifier."""
     beside = Path(shutil.copy(source, path.with_suffix(".new")))
     with h5py.File(beside, "r+") as file:
-        file.attrs["site"] = json.dumps(json.loads(file.attrs["site"]) | {"name": site_name})
-        digests = {name: str(file[name].attrs["sha256"]) for name in dataset_paths(file)}
-        file.attrs["table_id"] = table_id = content_id(content_attributes(file), digests)
+        change_site(file, lambda site: site | {"name": site_name})
+        table_id = sign(file)
     os.replace(beside, path)
     return table_id
 

@@ -1,9 +1,12 @@
-"""How far a station's part is from a whole build, when cells were kept though their rays had changed a little."""
+"""A station's part of a table, as it is written and read."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from rayfix_tables.level import Level
+from rayfix_tables.site import Station
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,3 +40,29 @@ class Update:
     def num_changed(self) -> int:
         """Number of cells that differ from those of a whole build."""
         return sum(int(np.count_nonzero(change)) for change in self.cell_change)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationPart:
+    """A station's part of a table.
+
+    Attributes
+    ----------
+    levels : tuple of Level
+        Finest first.
+    lost_ray_share : float
+        Share of the launched rays that left the scene without having come to their last reflection.
+    coverage : tuple of float
+        Share of the free space that is reached with at most 0, 1, 2, ... reflections.
+    part_id : str
+        Names all that decided the part's content, so that a later build can tell whether it is still right.
+    update : Update, optional
+        Of a part with cells that a whole build would have made slightly differently.
+    """
+
+    station: Station
+    levels: tuple[Level, ...]
+    lost_ray_share: float
+    coverage: tuple[float, ...]
+    part_id: str = ""
+    update: Update | None = None
