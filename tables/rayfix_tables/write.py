@@ -4,7 +4,7 @@ import contextlib
 import io
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -114,6 +114,7 @@ def write_table(
     scene: SceneContent,
     stations: Sequence[StationContent],
     software_version: str,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> str:
     """Write a table file and return its ``table_id``.
 
@@ -123,6 +124,8 @@ def write_table(
     ----------
     stations : sequence of StationContent
         In the order of ``site.stations``.
+    progress : callable, optional
+        Called with the number of bytes that are written, and with that of all.
 
     Raises
     ------
@@ -136,7 +139,7 @@ def write_table(
         with _Sink(descriptor, "w+") as sink:
             try:
                 with h5py.File(sink, "w", alignment_threshold=1, alignment_interval=64) as file:
-                    table_id = _write_content(file, site, scene, stations, software_version)
+                    table_id = _write_content(file, site, scene, stations, software_version, progress)
             finally:
                 sink.raise_failure()
             os.fsync(sink.fileno())
@@ -198,7 +201,10 @@ def _write_content(
     scene: SceneContent,
     stations: Sequence[StationContent],
     software_version: str,
+    progress: Callable[[int, int], None],
 ) -> str:
+    total, done = sum(level.num_bytes for content in stations for level in content.levels), 0
+    progress(done, total)
     _write_scene(file, scene)
     for station, content in zip(site.stations, stations, strict=True):
         group = file.create_group(f"stations/{station.id}")
@@ -212,6 +218,8 @@ def _write_content(
         group.attrs["coverage"] = np.asarray(content.coverage)
         for n, level in enumerate(content.levels):
             _write_level(file.create_group(level_path(station.id, n)), level)
+            done += level.num_bytes
+            progress(done, total)
         if content.update is not None:
             _write_update(group, content.update)
     file.attrs["format"] = FORMAT

@@ -18,6 +18,7 @@ from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_pri
 from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
+from rayfix_tables.gaussians.compilation import announce_compilation
 from rayfix_tables.table import Table
 
 _NO_RAYS = "no ray of station '{}' comes from that direction"
@@ -45,6 +46,7 @@ class Locator:
     """
 
     def __init__(self, table: Table, settings: FusionSettings | None = None) -> None:
+        announce_compilation()
         self.table = table
         self.settings = settings or FusionSettings()
         self._uniform_prior = uniform_prior(table.scene.free_space)

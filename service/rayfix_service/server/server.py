@@ -21,7 +21,7 @@ import uvicorn
 from rayfix_service.http.access.keys import read_key_file
 from rayfix_service.http.access.rates import Accounts
 from rayfix_service.http.answering.runtime_folder import runtime_folder
-from rayfix_service.http.answering.served_tables import follow_changes, load_tables
+from rayfix_service.http.answering.served_tables import ServedTable, follow_changes, load_tables
 from rayfix_service.http.answering.table_checks import TableChecks
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.settings import ConnectionLimits, ServiceSettings
@@ -110,7 +110,7 @@ def serve(
         if MULTIPROCESS_VARIABLE in os.environ:
             _check_room(Path(os.environ[MULTIPROCESS_VARIABLE]))
         checks = TableChecks(settings.runtime_folder, settings.table_check)
-        at_hand = load_tables(path, checks=checks)
+        at_hand: dict[str, ServedTable] = {}
         limits = fitting(settings.connection_limits)
         config = uvicorn.Config(
             partial(create_app, path, settings, at_hand=at_hand, accounts=Accounts()),
@@ -129,6 +129,7 @@ def serve(
         )
         if limits != settings.connection_limits:
             _log.warning(_FEW_FILES, limits.connections, settings.connection_limits.connections)
+        at_hand.update(load_tables(path, checks=checks))  # with logging as configured: kernels may be compiled
         if workers == 1:
             with suppress(KeyboardInterrupt):
                 _run(config)
