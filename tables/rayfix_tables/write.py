@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import os
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.disk.files import has_signature, why_not_regular
-from rayfix_tables.disk.ownership import own_file, remove_abandoned
+from rayfix_tables.disk.ownership import own_file, remove_abandoned, try_lock
 from rayfix_tables.disk.schema import (
     FORMAT,
     FORMAT_VERSION,
@@ -31,6 +32,9 @@ from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES
 from rayfix_tables.site import SiteInfo
 from rayfix_tables.update import Update
+
+_LOOKS, _LOOK_SECONDS = 5, 0.05
+"""At a lock: another build holds one for a moment when it renames its table into place."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +104,26 @@ def check_writable(path: Path) -> None:
     if path.exists() and path.stat().st_size and not _is_hdf5(path):
         # A site file or a scene by a slip of the hand: only a table gives way to a table.
         raise TableError(f"cannot write {path}: the file there is no table; give another name, or remove it first")
+    if path.exists() and _is_being_written(path):
+        raise TableError(
+            f"cannot write {path}: another program has locked it to write to it; end that, or give another name"
+        )
+
+
+def _is_being_written(path: Path) -> bool:
+    """Whether a program holds the lock of a writer on a file, as HDF5 takes it. Readers may go on with the old file."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        for _ in range(_LOOKS):
+            if try_lock(descriptor, shared=True) is not False:
+                return False
+            time.sleep(_LOOK_SECONDS)
+        return True
+    finally:
+        os.close(descriptor)
 
 
 def _is_hdf5(path: Path) -> bool:
