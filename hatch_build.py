@@ -8,6 +8,7 @@ The environment variable ``RAYFIX_VIEWER`` decides what happens where they have 
 """
 
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -51,7 +52,7 @@ class ViewerBuildHook(BuildHookInterface):
 def reason(output: str) -> str:
     """Return the line of npm's output that says most: the first of its errors, else the last line of all."""
     lines = [line.strip() for line in output.splitlines() if line.strip()]
-    errors = [line for line in lines if line.startswith(("npm error", "npm ERR!")) and " code " not in line]
+    errors = [line for line in lines if re.match(r"npm (error|ERR!) (?!code|syscall|errno|A complete log)", line)]
     return (errors or lines[-1:] or ["it said nothing"])[0]
 
 

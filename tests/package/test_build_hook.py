@@ -67,7 +67,11 @@ def test_without_node_the_package_is_without_the_viewer_and_says_so(hook: Any, m
 
 def test_an_npm_that_fails_is_one_line_with_the_way_out(hook: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     program(hook.root, "node", "echo v22.1.0")
-    program(hook.root, "npm", "echo 'npm error code EAI_AGAIN'; echo 'npm error getaddrinfo EAI_AGAIN'; exit 1")
+    program(
+        hook.root,
+        "npm",
+        "echo 'npm error code EAI_AGAIN'; echo 'npm error errno -3'; echo 'npm error getaddrinfo EAI_AGAIN'; exit 1",
+    )
     with pytest.raises(SystemExit) as stopped:
         hook.hook.initialize("standard", {})
     assert str(stopped.value) == (
