@@ -1,104 +1,21 @@
-"""What the command line shows: progress bars, summaries, tables and fixes."""
+"""What the command line shows: summaries, tables and fixes."""
 
-import resource
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich import box
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TaskID,
-    TaskProgressColumn,
-    TextColumn,
-)
 from rich.table import Table as Grid
-from rich.text import Text
 
 from rayfix_tables.part import Update
 from rayfix_tables.table import Table
 
 if TYPE_CHECKING:
     from rayfix_offline.build import BuildSummary
-    from rayfix_offline.build import Progress as BuildProgress
     from rayfix_offline.check import Check
-
-
-_TABLE_STAGES = ("reading the scene", "balancing", "writing")
-"""Of a build, besides those of stations and levels."""
-
-
-@contextmanager
-def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
-    """Show stage, rate, time that is left and memory on standard error."""
-    if not enabled:
-        yield None
-        return
-    bar = Progress(
-        TextColumn("{task.description:<20}"),
-        BarColumn(bar_width=12),
-        TaskProgressColumn(),
-        _RateColumn(),
-        _TimesColumn(),
-        _MemoryColumn(),
-        console=Console(stderr=True),
-    )
-    task = bar.add_task("starting", total=None)
-
-    def show(stage: str, done: int, total: int) -> None:
-        # Until the work is known there is nothing to draw, and a mistake in the site is one line only.
-        if total:
-            bar.start()
-            bar.update(task, description=stage, completed=done, total=total)
-
-    with _stopped(bar):
-        yield show
-
-
-@contextmanager
-def evaluation_progress(*, enabled: bool) -> "Iterator[Callable[[str, int, int], None]]":
-    """Show each stage of an evaluation and the time that is left of it on standard error."""
-    if not enabled:
-        yield lambda stage, done, total: None
-        return
-    bar = Progress(
-        TextColumn("{task.description:<24}"),
-        BarColumn(bar_width=24),
-        TaskProgressColumn(),
-        _TimesColumn(),
-        console=Console(stderr=True),
-    )
-    tasks: dict[str, TaskID] = {}
-
-    def show(stage: str, done: int, total: int) -> None:
-        # Stages of a table being built come by station and level; one bar stands for them.
-        name = "building tables" if ":" in stage or stage in _TABLE_STAGES else stage
-        if not total:
-            return
-        bar.start()
-        if name not in tasks:
-            tasks[name] = bar.add_task(name, total=total)
-        bar.update(tasks[name], completed=done, total=total)
-
-    with _stopped(bar):
-        yield show
-
-
-@contextmanager
-def _stopped(bar: Progress) -> Iterator[None]:
-    """Stop a bar in the end; one that was never shown would leave an empty line."""
-    try:
-        yield
-    finally:
-        if bar.live.is_started:
-            bar.stop()
 
 
 def print_evaluation(results: Mapping[str, Any], page: Path) -> None:
@@ -118,35 +35,6 @@ def print_evaluation(results: Mapping[str, Any], page: Path) -> None:
         verdict = "holds" if statement["holds"] else "does not hold"
         console.print(f"[bold]{verdict:<13}[/bold]  {statement['method']}: {statement['claim']}", highlight=False)
     console.print(f"The report is {page}", highlight=False, soft_wrap=True)
-
-
-class _RateColumn(ProgressColumn):
-    """Cells that are done in a second."""
-
-    def render(self, task: Task) -> Text:
-        return Text(f"{task.speed:,.0f} cells/s" if task.speed else "", justify="right")
-
-
-class _TimesColumn(ProgressColumn):
-    """Time that is gone, and what is left of it while there is work."""
-
-    def render(self, task: Task) -> Text:
-        gone = _clock(task.finished_time if task.finished else task.elapsed)
-        return Text(gone if task.finished else f"{gone}, {_clock(task.time_remaining)} left")
-
-
-def _clock(seconds: float | None) -> str:
-    if seconds is None:
-        return "-:--"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}:{rest:02d}"
-
-
-class _MemoryColumn(ProgressColumn):
-    """Most memory that the process has held."""
-
-    def render(self, task: Task) -> Text:
-        return Text(f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9:.1f} GB")
 
 
 def print_check(check: "Check") -> None:

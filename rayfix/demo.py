@@ -14,15 +14,20 @@ from typing import Any
 import httpx
 import numpy as np
 
-from rayfix.console import build_progress, counted, place, print_build_summary
+from rayfix.console import counted, place, print_build_summary
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths, report_text, simulate_example_report
 from rayfix.example.files import REPORT_FILE, write_example
+from rayfix.own_command import own_command
+from rayfix.progress import build_progress
 from rayfix_evaluation.pictures.plot import plot_fix
 from rayfix_offline.build import build_table
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table
 
-_READY_SECONDS = 120.0
+_IDLE_SECONDS = 120.0
+"""A service that for so long has neither worked nor logged anything, and is not ready, hangs."""
+
+_ANSWER_SECONDS = 600.0
 
 
 def run_demo(folder: Path, *, jobs: int = -1) -> float:
@@ -61,7 +66,10 @@ def run_demo(folder: Path, *, jobs: int = -1) -> float:
 
     print("\n3. The service takes the report.")
     with _service(table_path) as url:
-        answer = httpx.post(f"{url}/v1/positions", json=report, timeout=30.0, trust_env=False)
+        try:
+            answer = httpx.post(f"{url}/v1/positions", json=report, timeout=_ANSWER_SECONDS, trust_env=False)
+        except httpx.TransportError as failure:
+            raise RayfixError(f"the service gave no answer ({failure}); its log is {_log_of(table_path)}") from failure
     if answer.status_code != httpx.codes.OK:
         raise RayfixError(f"the service answered {answer.status_code}: {answer.text}")
     document = answer.json()
@@ -71,7 +79,7 @@ def run_demo(folder: Path, *, jobs: int = -1) -> float:
     rays = {name: found.vertices[0] for name, found in paths.items()}
     plot_fix(picture, Table.open(table_path), document, truth=EXAMPLE_POSITION, rays=rays)
     print(f"\nThe picture is {picture}. All this took {time.perf_counter() - begin:.0f} s.")
-    print(f"Serve this table yourself: rayfix serve {table_path}")
+    print(f"Serve this table yourself: {own_command()} serve {table_path}")
     return error
 
 
@@ -102,7 +110,7 @@ def _service(table_path: Path) -> Iterator[str]:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     url = f"http://127.0.0.1:{port}"
-    log = table_path.with_name("service.log")
+    log = _log_of(table_path)
     with log.open("wb") as sink:
         process = subprocess.Popen(
             [sys.executable, "-m", "rayfix", "serve", str(table_path), "--port", str(port)],
@@ -121,15 +129,50 @@ def _service(table_path: Path) -> Iterator[str]:
                 process.wait()
 
 
+def _log_of(table_path: Path) -> Path:
+    return table_path.with_name("service.log")
+
+
 def _wait_until_ready(url: str, process: subprocess.Popen[bytes], log: Path) -> None:
-    end = time.monotonic() + _READY_SECONDS
-    while time.monotonic() < end:
-        if process.poll() is not None:
-            break
+    """Wait as long as the service lives and works, and show what it logs meanwhile."""
+    shown = 0
+    trace, since = _trace(process.pid, log), time.monotonic()
+    while process.poll() is None:
         try:
             if httpx.get(f"{url}/readyz", timeout=2.0, trust_env=False).status_code == httpx.codes.OK:
                 return
         except httpx.TransportError:
             pass
         time.sleep(0.1)
-    raise RayfixError(f"the service did not start; its last words are in {log}")
+        shown = _show_kernels(log, shown)
+        if (now := _trace(process.pid, log)) != trace:
+            trace, since = now, time.monotonic()
+        elif time.monotonic() - since > _IDLE_SECONDS:
+            raise RayfixError(f"the service has done nothing for {_IDLE_SECONDS:.0f} s; its log is {log}")
+    raise RayfixError(f"the service ended with status {process.returncode}; its log {log} says why{_last_line(log)}")
+
+
+def _trace(pid: int, log: Path) -> tuple[str, int]:
+    """Return what grows while a process works: its processor time and its log."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+    except OSError:  # ended just now
+        fields = []
+    return " ".join(fields[11:15]), log.stat().st_size
+
+
+def _show_kernels(log: Path, shown: int) -> int:
+    """Print the whole lines on kernels that were logged after a position; returns the position after them."""
+    with log.open("rb") as file:
+        file.seek(shown)
+        new = file.read()
+    whole = new[: new.rfind(b"\n") + 1]
+    for line in whole.decode("utf-8", "replace").splitlines():
+        if "kernels" in line:
+            print(f"   {line.partition(':')[2].strip()}", flush=True)
+    return shown + len(whole)
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return f": {lines[-1]}" if lines else ""

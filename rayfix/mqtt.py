@@ -30,7 +30,7 @@ def serve_mqtt(table_path: Path, broker: Broker, settings: MqttSettings) -> None
     check_settings(settings)
     table = open_checked(table_path)
     check_stations(settings.stations, table.parts)
-    _log.info("loading %s; the first start after an installation compiles kernels, which takes a minute", table_path)
+    _log.info("loading %s", table_path)
     locator = Locator(table)
     locator.warm_up()
     asyncio.run(_until_told(locator, broker, settings))

@@ -12,7 +12,7 @@ from typing import Any
 
 from rayfix.errors import ViewError
 from rayfix_service.locator import Locator
-from rayfix_service.web.assets import INDEX, STATIC
+from rayfix_service.web.assets import INDEX, STATIC, viewer_is_built
 from rayfix_service.web.glb import write_glb
 from rayfix_service.web.viewer_settings import picture_posterior, viewer_settings
 from rayfix_service.wire import InvalidReportError, fix_to_document, parse_report, read_json
@@ -115,9 +115,10 @@ def render_view(name: str, table: Table, events: list[dict[str, Any]]) -> str:
 
 def inline(static: Path, data: Mapping[str, Any], *, title: str) -> str:
     """Put the built viewer and data into one page, whose policy allows its own script and style and nothing else."""
-    if not (static / INDEX).is_file():
+    if not viewer_is_built(static):
         raise ViewError(
-            "the viewer is not built; run 'make viewer' in the checkout, or install a package, which has it"
+            "this installation is without the viewer, as there was no Node.js 20.19 or later when it was made; install "
+            "rayfix again with that, or run 'make viewer' in a checkout; 'rayfix plot' draws a fix without it"
         )
     page = (static / INDEX).read_text(encoding="utf-8")
     script = _only(static, "*.js").replace("</script", "<\\/script").replace("<!--", "<\\!--")

@@ -5,16 +5,18 @@ ended. Stations and cells of a former table that are still valid are taken from 
 """
 
 import resource
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from joblib import Parallel, delayed
 
-from rayfix_offline.fit.normalise import balanced
+from rayfix_offline.fit.normalise import balanced, balancing_steps
 from rayfix_offline.job.engine import FittingEngine, Job
 from rayfix_offline.job.local import LocalEngine
 from rayfix_offline.job.method import Method
@@ -32,7 +34,11 @@ from rayfix_tables.version import software_version
 from rayfix_tables.write import check_writable, write_table
 
 Progress = Callable[[str, int, int], None]
-"""Called with the stage, the number of cells that are done and their total number (0 while it is unknown)."""
+"""Called with the stage, how much of its work is done, and all of it; 0 while that is unknown.
+
+The work is counted in cells, but in steps while balancing and in bytes while writing. Calls may come from several
+threads, one at a time.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,22 +154,20 @@ def build_table(
         job = Job(
             site=twin.site, twin=twin, method=method, store=store, jobs=jobs, former=former_table, tolerance=tolerance
         )
-        total = sum(plan.num_cells for plan in plans)
         built = _build_stations(plans, job, cluster, report)
-        report("balancing", total, total)
-        built = _balanced(built, job)
+        built = _balanced(built, job, report)
         parts = [
             replace(station.part, station=given) for station, given in zip(built, site.info().stations, strict=True)
         ]
         if not any(len(level.mixture) for part in parts for level in part.levels):
             raise BuildError("no ray of any station finds free space; check the stations' positions and fields of view")
-        report("writing", total, total)
         table_id = write_table(
             table_path,
             site=site.info(),
             scene=_scene_of(twin),
             parts=parts,
             software_version=software_version(),
+            progress=partial(report, "writing"),
         )
         store.remove()
     stations = tuple(_summary(plan.station.id, station) for plan, station in zip(plans, built, strict=True))
@@ -202,7 +206,7 @@ def _build_stations(
     return built
 
 
-def _balanced(stations: list[BuiltStation], job: Job) -> list[BuiltStation]:
+def _balanced(stations: list[BuiltStation], job: Job, report: Progress) -> list[BuiltStation]:
     """Normalise all levels, if the path prior is one whose probabilities add up to 1 at each position.
 
     A part that was kept as a whole belongs to the same free space, so that it remains valid.
@@ -210,7 +214,10 @@ def _balanced(stations: list[BuiltStation], job: Job) -> list[BuiltStation]:
     if job.site.propagation.path_prior != "power":
         return stations
     levels = [level for station in stations if not _keeps_balance(station) for level in station.part.levels]
-    tasks = (delayed(balanced)(level, job.twin.free_space, job.method.balance) for level in levels)
+    advance = _Counter("balancing", sum(balancing_steps(level, job.method.balance) for level in levels), report)
+    tasks = (
+        delayed(balanced)(level, job.twin.free_space, job.method.balance, advance=advance.advance) for level in levels
+    )
     done = iter(Parallel(n_jobs=job.jobs, prefer="threads")(tasks))
     return [
         station
@@ -218,6 +225,23 @@ def _balanced(stations: list[BuiltStation], job: Job) -> list[BuiltStation]:
         else replace(station, part=replace(station.part, levels=tuple(next(done) for _ in station.part.levels)))
         for station in stations
     ]
+
+
+class _Counter:
+    """Progress of a stage to which several threads contribute."""
+
+    def __init__(self, stage: str, total: int, report: Progress) -> None:
+        self._stage, self._total, self._report = stage, total, report
+        self._done = 0
+        self._lock = threading.Lock()
+        if total:
+            report(stage, 0, total)
+
+    def advance(self, steps: int) -> None:
+        """Count and report steps that were taken."""
+        with self._lock:
+            self._done += steps
+            self._report(self._stage, self._done, self._total)
 
 
 def _keeps_balance(station: BuiltStation) -> bool:

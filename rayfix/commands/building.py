@@ -59,7 +59,8 @@ def _build(options: argparse.Namespace) -> int:
     with needs_extra("offline"):
         from rayfix_offline.build import build_table
 
-    from rayfix.console import build_progress, print_build_summary
+    from rayfix.console import print_build_summary
+    from rayfix.progress import build_progress
 
     with build_progress(enabled=not options.no_progress) as progress:
         summary = build_table(

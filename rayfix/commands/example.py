@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rayfix.commands.arguments import AddCommand, add_jobs_argument
 from rayfix.extras import needs_extra
+from rayfix.own_command import own_command
 
 
 def add_commands(add: AddCommand) -> None:
@@ -29,5 +30,7 @@ def _example(options: argparse.Namespace) -> int:
         from rayfix.example.files import write_example
 
         site = write_example(options.folder)
-    print(f"Wrote {site} with its scene and a report. Next: rayfix build {site} -o {options.folder / 'hall.h5'}")
+    print(
+        f"Wrote {site} with its scene and a report. Next: {own_command()} build {site} -o {options.folder / 'hall.h5'}"
+    )
     return 0

@@ -74,7 +74,8 @@ def _evaluate(options: argparse.Namespace) -> int:
     with needs_extra("evaluate"):
         from rayfix_evaluation.report.write import PAGE, run_evaluation
 
-    from rayfix.console import evaluation_progress, print_evaluation
+    from rayfix.console import print_evaluation
+    from rayfix.progress import evaluation_progress
 
     with evaluation_progress(enabled=not options.no_progress) as progress:
         found = run_evaluation(

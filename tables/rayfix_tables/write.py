@@ -4,7 +4,8 @@ import contextlib
 import io
 import json
 import os
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.disk.files import has_signature, why_not_regular
-from rayfix_tables.disk.ownership import own_file, remove_abandoned
+from rayfix_tables.disk.ownership import own_file, remove_abandoned, try_lock
 from rayfix_tables.disk.schema import (
     FORMAT,
     FORMAT_VERSION,
@@ -35,6 +36,9 @@ from rayfix_tables.site import SiteInfo
 
 _LIBVER = ("v108", "v108")
 """Of HDF5's own structures: those since 1.8 have checksums, so that a damaged one is found and not followed."""
+
+_LOOKS, _LOOK_SECONDS = 5, 0.05
+"""At a lock: another build holds one for a moment when it renames its table into place."""
 
 
 def check_folder(path: Path, error: type[RayfixError]) -> None:
@@ -61,6 +65,26 @@ def check_writable(path: Path) -> None:
     if path.exists() and path.stat().st_size and not _is_hdf5(path):
         # A site file or a scene by a slip of the hand: only a table gives way to a table.
         raise TableError(f"cannot write {path}: the file there is no table; give another name, or remove it first")
+    if path.exists() and _is_being_written(path):
+        raise TableError(
+            f"cannot write {path}: another program has locked it to write to it; end that, or give another name"
+        )
+
+
+def _is_being_written(path: Path) -> bool:
+    """Whether a program holds the lock of a writer on a file, as HDF5 takes it. Readers may go on with the old file."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        for _ in range(_LOOKS):
+            if try_lock(descriptor, shared=True) is not False:
+                return False
+            time.sleep(_LOOK_SECONDS)
+        return True
+    finally:
+        os.close(descriptor)
 
 
 def _is_hdf5(path: Path) -> bool:
@@ -75,6 +99,7 @@ def write_table(
     scene: Scene,
     parts: Sequence[StationPart],
     software_version: str,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> str:
     """Write a table file and return its ``table_id``.
 
@@ -84,6 +109,8 @@ def write_table(
     ----------
     parts : sequence of StationPart
         Of ``site.stations``, in their order.
+    progress : callable, optional
+        Called with the number of bytes that are written, and with that of all.
 
     Raises
     ------
@@ -101,7 +128,7 @@ def write_table(
         with _Sink(descriptor, "w+") as sink:
             try:
                 with h5py.File(sink, "w", libver=_LIBVER, alignment_threshold=1, alignment_interval=64) as file:
-                    table_id = _write_content(file, site, scene, parts, software_version)
+                    table_id = _write_content(file, site, scene, parts, software_version, progress)
             finally:
                 sink.raise_failure()
             os.fsync(sink.fileno())
@@ -163,11 +190,16 @@ def _write_content(
     scene: Scene,
     parts: Sequence[StationPart],
     software_version: str,
+    progress: Callable[[int, int], None],
 ) -> str:
+    total, done = sum(level.num_bytes for part in parts for level in part.levels), 0
+    progress(done, total)
     _write_json(file, "site", _site_document(site))
     _write_scene(file, scene)
     for part in parts:
         _write_part(file, part, scene.origin)
+        done += sum(level.num_bytes for level in part.levels)
+        progress(done, total)
     file.attrs["format_version"] = FORMAT_VERSION
     for name, text in (("format", FORMAT), ("software_version", software_version), ("scene_sha256", scene.sha256)):
         write_text(file, name, text)

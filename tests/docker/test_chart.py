@@ -8,6 +8,7 @@ import yaml
 
 from rayfix.cli import make_parser
 from rayfix_service.http.access.keys import read_key_file
+from rayfix_service.http.settings import BodyLimits
 from tests.support.checkout import ROOT
 
 helm_python = pytest.importorskip("helm_python", reason="Helm's library has no wheel for this machine")
@@ -17,10 +18,11 @@ CHART = ROOT / "docker/helm/rayfix"
 KUBERNETES = ("1.30", "1.34")
 TABLE_ID = "0123456789abcdef" * 4
 KEY = "gateway:" + "0123456789abcdef" * 4
+FILE = {"name": "hall.glb", "url": "https://store.example/hall.glb?signature=1", "sha256": TABLE_ID}
 VALUES: dict[str, dict[str, Any]] = {
     "as it is": {},
     "fetched": {"table": {"source": "url", "url": "https://store.example/hall.h5?signature=1", "id": TABLE_ID}},
-    "site in values": {"site": {"toml": "[site]\n", "sceneFile": "hall.glb", "sceneBase64": "Z2xURg=="}},
+    "site in values": {"site": {"toml": "[site]\n", "files": [FILE]}},
     "site in a claim": {"site": {"existingClaim": "sites", "revision": "2"}, "build": {"cluster": "tcp://dask:8786"}},
     "everything": {
         "autoscaling": {"enabled": False},
@@ -33,6 +35,7 @@ VALUES: dict[str, dict[str, Any]] = {
             "from": [{"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "ingress"}}}],
             "egress": [{"to": [{"ipBlock": {"cidr": "10.0.0.0/8"}}], "ports": [{"port": 8081}]}],
         },
+        "ingress": {"enabled": True, "host": "rayfix.example.com", "tlsSecret": "certificate"},
         "podAnnotations": {"a": "b"},
         "nodeSelector": {"disk": "ssd"},
         "tolerations": [{"key": "a", "operator": "Exists"}],
@@ -90,6 +93,12 @@ def test_the_schema_would_object():
         {"table": {"source": "url"}},
         {"table": {"source": "bucket"}},
         {"service": {"workers": 0}},
+        {"site": {"files": [FILE]}},
+        {"site": {"toml": "[site]\n", "files": [FILE], "existingClaim": "sites"}},
+        {"site": {"toml": "[site]\n", "files": [FILE | {"name": "../hall.glb"}]}},
+        {"site": {"toml": "[site]\n", "files": [FILE | {"sha256": ""}]}},
+        {"site": {"sceneBase64": "Z2xURg=="}},
+        {"ingress": {"enabled": True}},
         {"networkPolicy": {"enable": True}},
         {"images": {"service": {"repository": "r", "digest": "sha256:0"}}},
     ],
@@ -183,6 +192,51 @@ def test_what_is_needed_may_be_asked():
     everything = policies(VALUES["everything"])["service"]
     assert ports(everything["egress"]) == [53, 53, 8081]
     assert everything["ingress"][0]["from"] == VALUES["everything"]["networkPolicy"]["from"]
+
+
+def test_a_scene_of_any_size_is_fetched_beside_the_site_file():
+    """The release and the commands that make it hold the scene's address and hash, whatever its size."""
+    second = FILE | {"name": "hall.bin", "url": "http://store:9000/hall.bin"}
+    values = {"site": {"toml": "[site]\n", "files": [FILE, second]}}
+    pod = only(render(values), "Job")["spec"]["template"]["spec"]
+    (fetch,), (build,) = pod["initContainers"], pod["containers"]
+    assert fetch["args"] == ["/scene", *FILE.values(), *second.values()]
+    (scene,) = (mount for mount in fetch["volumeMounts"] if mount["mountPath"] == "/scene")
+    mounts = {mount["mountPath"]: mount for mount in build["volumeMounts"]}
+    assert mounts["/site"]["name"] == scene["name"]
+    assert mounts["/site/site.toml"]["subPath"] == "site.toml"
+    assert ports(policies(values)["offline"]["egress"]) == [53, 53, 443, 9000]
+
+
+def test_another_signature_of_a_file_is_the_same_table_and_another_file_is_not():
+    def job(**changes: str) -> str:
+        return str(only(render({"site": {"toml": "[site]\n", "files": [FILE | changes]}}), "Job")["metadata"]["name"])
+
+    assert job(url="https://store.example/hall.glb?signature=2") == job()
+    assert job(sha256="f" * 64) != job()
+
+
+def test_the_ingress_lets_streams_and_batches_through():
+    objects = render(VALUES["everything"])
+    ingress, service = only(objects, "Ingress"), only(objects, "Service")
+    (rule,) = ingress["spec"]["rules"]
+    (path,) = rule["http"]["paths"]
+    assert path["backend"]["service"]["name"] == service["metadata"]["name"]
+    assert path["backend"]["service"]["port"]["name"] in {port["name"] for port in service["spec"]["ports"]}
+    assert ingress["spec"]["tls"] == [{"hosts": [rule["host"]], "secretName": "certificate"}]
+    nginx = {name.rpartition("/")[2]: value for name, value in ingress["metadata"]["annotations"].items()}
+    assert nginx["proxy-buffering"] == "off"
+    assert int(nginx["proxy-read-timeout"]) >= 3600 <= int(nginx["proxy-send-timeout"])
+    assert int(nginx["proxy-body-size"].removesuffix("m")) << 20 >= BodyLimits().batch
+    assert not [kind for kind, _ in render({}) if kind == "Ingress"]
+
+
+def test_a_pod_may_take_as_long_to_start_as_the_values_say():
+    (container,) = only(render({"service": {"startSeconds": 901}}), "Deployment")["spec"]["template"]["spec"][
+        "containers"
+    ]
+    probe = container["startupProbe"]
+    assert probe["failureThreshold"] * probe["periodSeconds"] == 900
 
 
 def test_policies_can_be_left_out():

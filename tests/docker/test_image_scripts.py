@@ -1,6 +1,7 @@
 """Programs that only the images have, run as they are."""
 
 import functools
+import hashlib
 import subprocess
 import sys
 import threading
@@ -71,6 +72,28 @@ def test_a_table_is_fetched_by_its_hash(store: str, room_path: Path, tmp_path: P
 def test_nothing_else_is_taken(store: str, room_path: Path, tmp_path: Path, name: str, table_id: str | None, word: str):
     table_id = table_id or Table.open(room_path).table_id
     done = run("fetch_table.py", f"{store}/{name}?signature=secret", table_id, tmp_path / "site.h5")
+    assert done.returncode == 1
+    assert word in done.stderr
+    assert "secret" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_of_a_site_are_fetched_by_their_hashes(store: str, room_path: Path, tmp_path: Path):
+    names = ("room.h5", "other.h5")
+    files = [
+        (name, f"{store}/{name}?signature=secret", hashlib.sha256(room_path.with_name(name).read_bytes()).hexdigest())
+        for name in names
+    ]
+    done = run("fetch_files.py", tmp_path, *files[0], *files[1])
+    assert done.returncode == 0, done.stderr
+    for name in names:
+        assert (tmp_path / name).read_bytes() == room_path.with_name(name).read_bytes()
+    assert run("fetch_files.py", tmp_path, "room.h5", "http://127.0.0.1:9/", files[0][2]).returncode == 0
+
+
+@pytest.mark.parametrize(("name", "word"), [("room.h5", "not 0000"), ("none.h5", "404")])
+def test_a_file_with_another_hash_is_not_taken(store: str, tmp_path: Path, name: str, word: str):
+    done = run("fetch_files.py", tmp_path, name, f"{store}/{name}?signature=secret", "0" * 64)
     assert done.returncode == 1
     assert word in done.stderr
     assert "secret" not in done.stderr

@@ -12,6 +12,7 @@ J. Opt. Soc. Am. 62 (1), 1972, for a uniform image). A round changes no componen
 the total is much smaller than 1, the station is not audible, and the density has leaked from elsewhere.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -33,7 +34,18 @@ _CHUNK = 2**16
 Array = NDArray[np.float64]
 
 
-def balanced(level: Level, free_space: FreeSpace, settings: BalanceSettings | None = None) -> Level:
+def balancing_steps(level: Level, settings: BalanceSettings | None = None) -> int:
+    """Count the steps of :func:`balanced`: each component is conditioned once and reweighted in each round."""
+    return len(level.mixture) * (1 + (settings or BalanceSettings()).rounds)
+
+
+def balanced(
+    level: Level,
+    free_space: FreeSpace,
+    settings: BalanceSettings | None = None,
+    *,
+    advance: Callable[[int], None] = lambda steps: None,
+) -> Level:
     """Compute the ``log_balance`` of a level.
 
     Parameters
@@ -42,11 +54,13 @@ def balanced(level: Level, free_space: FreeSpace, settings: BalanceSettings | No
     free_space : FreeSpace
         Of the scene that the level was made for.
     settings : BalanceSettings, optional
+    advance : callable, optional
+        Called with the number of steps that were taken since the last call.
     """
     settings = settings or BalanceSettings()
     if not len(level.mixture):
         return replace(level, log_balance=UNBALANCED)
-    positions = _positions(level, settings)
+    positions = _positions(level, settings, advance)
     points = np.array(normal_points(settings.num_points))
     blocks = _blocks(free_space, settings.block_size)
     most = settings.max_factor
@@ -59,6 +73,7 @@ def balanced(level: Level, free_space: FreeSpace, settings: BalanceSettings | No
         _gather(positions.mean, positions.root, points, *blocks.voxels, ratio, gain)
         weight *= gain
         log_balance += np.log(gain)
+        advance(len(weight))
     return replace(level, log_balance=log_balance.astype(np.float32))
 
 
@@ -102,7 +117,7 @@ class _Blocks(NamedTuple):
         return self.origin, self.voxel_size, self.free, self.side
 
 
-def _positions(level: Level, settings: BalanceSettings) -> _Positions:
+def _positions(level: Level, settings: BalanceSettings, advance: Callable[[int], None]) -> _Positions:
     """Condition all cells on a measurement in the middle of the cell, with the noise that the window is for.
 
     Multiplied by the cells' solid angles, this sums over all directions that may be measured.
@@ -131,6 +146,7 @@ def _positions(level: Level, settings: BalanceSettings) -> _Positions:
         root[begin:end], definite = cholesky_factors(cov[:, :3, :3] + settings.thickness * np.eye(3))
         # A component without a covariance has no position: it adds to no block, and its weight does not change.
         mean[begin:end][~definite] = np.nan
+        advance(end - begin)
     return _Positions(weight, mean, root)
 
 

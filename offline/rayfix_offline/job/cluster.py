@@ -9,13 +9,15 @@ import threading
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import CancelledError
 from typing import Any
 
 import numpy as np
-from distributed import Client, as_completed
+from distributed import Client, Future, wait
 from numpy.typing import NDArray
 
 from rayfix_offline.fit.cells import FittedCells, fit_cells, widen_cells
+from rayfix_offline.job.cluster_workers import ClusterWorkers
 from rayfix_offline.job.engine import FittedBlocks, Job
 from rayfix_offline.job.local import LocalEngine
 from rayfix_offline.job.method import Method
@@ -28,6 +30,9 @@ from rayfix_offline.site import SiteFile, parse_site
 from rayfix_offline.twin.twin import prepare_scene
 from rayfix_tables.errors import BuildError
 from rayfix_tables.level import Level
+
+LOOK_SECONDS = 5.0
+"""Time between two looks at the workers while no result comes."""
 
 CONNECT_SECONDS = 15
 """Time-out of the connection to a scheduler, s."""
@@ -56,7 +61,7 @@ class Cluster:
     Raises
     ------
     BuildError
-        When no scheduler answers, or it has no workers.
+        When no scheduler answers, or it has no workers with this version of rayfix.
     """
 
     def __init__(self, address: str, job: Job) -> None:
@@ -69,6 +74,12 @@ class Cluster:
         if not self._client.scheduler_info()["workers"]:
             self._client.close()
             raise BuildError(f"the Dask scheduler at {address} has no workers; start some with 'dask worker {address}'")
+        self._workers = ClusterWorkers(self._client, address)
+        try:
+            self._workers.fit()
+        except BaseException:
+            self._client.close()
+            raise
         self._local = LocalEngine(job)
         self._inputs: _Inputs = (job.site.model_dump(mode="json"), job.twin.scene, job.method)
         self._inputs_id = content_key(self._inputs[0], job.twin.scene.sha256, job.method.identity())
@@ -128,16 +139,27 @@ class Cluster:
             # The finer level goes to the scheduler once and from there to each worker, of which Dask warns.
             warnings.simplefilter("ignore", UserWarning)
             source = self._client.submit(
-                _hand_on, finer, finer_change, key=f"rayfix-{plan.part_id}-under-{blocks[0].level}"
+                _hand_on,
+                finer,
+                finer_change,
+                key=f"rayfix-{plan.part_id}-under-{blocks[0].level}",
+                workers=self._workers.fit(),
             )
         tasks = {name: (_widen_remotely, (source, block.level, block.cells)) for name, block in by_name.items()}
         for name, arrays in self._run(plan, tasks):
             yield by_name[name], FittedCells.from_arrays(arrays)
 
     def _run(self, plan: StationPlan, tasks: Mapping[str, _Task]) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Run tasks on the workers."""
+        """Run tasks on the workers with this version.
+
+        Raises
+        ------
+        BuildError
+            When a task fails, or no worker is left.
+        """
+        fit = self._workers.fit()
         # A task returns the inputs, instead of scattered data, because Dask can repeat a task after a loss.
-        inputs = self._client.submit(_hand_on, *self._inputs, key=f"rayfix-inputs-{self._inputs_id}")
+        inputs = self._client.submit(_hand_on, *self._inputs, key=f"rayfix-inputs-{self._inputs_id}", workers=fit)
         futures = {
             self._client.submit(
                 run,
@@ -146,10 +168,11 @@ class Cluster:
                 *arguments,
                 key=f"rayfix-{plan.part_id}-{name}-{_fingerprint(arguments)}",
                 retries=RETRIES,
+                workers=fit,
             ): name
             for name, (run, arguments) in tasks.items()
         }
-        for future in as_completed(list(futures), loop=self._client.loop):
+        for future in self._as_completed(list(futures)):
             try:
                 arrays = future.result()
             except BuildError:
@@ -161,6 +184,22 @@ class Cluster:
                 ) from error
             yield futures[future], arrays
             future.release()
+
+    def _as_completed(self, waiting: list[Future]) -> Iterator[Future]:
+        """Futures as they are done; looks at the workers while none is."""
+        while waiting:
+            try:
+                with self._client.as_current():
+                    ready, rest = wait(waiting, timeout=LOOK_SECONDS, return_when="FIRST_COMPLETED")
+            except TimeoutError:
+                self._workers.check_left()
+                continue
+            except CancelledError as error:
+                raise BuildError(
+                    "the Dask scheduler has ended; finished blocks are kept, run the same build again to go on"
+                ) from error
+            yield from ready
+            waiting = list(rest)
 
 
 def _fingerprint(arguments: tuple[Any, ...]) -> str:

@@ -21,7 +21,7 @@ import uvicorn
 from rayfix_service.http.access.keys import read_key_file
 from rayfix_service.http.access.rates import Accounts
 from rayfix_service.http.answering.runtime_folder import runtime_folder
-from rayfix_service.http.answering.served_tables import follow_changes, load_tables
+from rayfix_service.http.answering.served_tables import ServedTable, follow_changes, load_tables
 from rayfix_service.http.answering.table_checks import TableChecks
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.http.settings import ConnectionLimits, ServiceSettings
@@ -32,6 +32,7 @@ from rayfix_service.process_wide import logging_restored
 from rayfix_service.server.app import create_app
 from rayfix_service.server.protocol import GatheringProtocol, SocketProtocol
 from rayfix_service.server.workers import COULD_NOT_START, run_workers, tell_failure, tell_started
+from rayfix_service.web.assets import viewer_is_built
 from rayfix_tables.errors import RayfixError
 
 _MESSAGES = 2  # times as long as a report may be, a message is answered that it is too long; then the connection ends
@@ -44,6 +45,8 @@ _TRACKS = (
     "each of the %d workers follows targets by itself, and the system chooses who answers a connection: a target's "
     "reports belong on one connection; else serve with one worker on each of several ports, balanced by target_id"
 )
+
+_NO_VIEWER = "this installation is without the viewer; / says how to get it, and /docs is a page without scripts"
 
 _FEW_FILES = (
     "a worker takes %d connections instead of %d, as it may not open more files; raise its limit (ulimit -n) "
@@ -111,7 +114,7 @@ def serve(
         if MULTIPROCESS_VARIABLE in os.environ:
             _check_room(Path(os.environ[MULTIPROCESS_VARIABLE]))
         checks = TableChecks(settings.runtime_folder, settings.table_check)
-        at_hand = load_tables(path, checks=checks)
+        at_hand: dict[str, ServedTable] = {}
         limits = fitting(settings.connection_limits)
         config = uvicorn.Config(
             partial(create_app, path, settings, at_hand=at_hand, accounts=Accounts()),
@@ -130,6 +133,9 @@ def serve(
         )
         if limits != settings.connection_limits:
             _log.warning(_FEW_FILES, limits.connections, settings.connection_limits.connections)
+        if not viewer_is_built():
+            _log.warning(_NO_VIEWER)
+        at_hand.update(load_tables(path, checks=checks))  # with logging as configured: kernels may be compiled
         if workers == 1:
             with suppress(KeyboardInterrupt):
                 _run(config)

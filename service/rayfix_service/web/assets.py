@@ -66,9 +66,14 @@ class Asset:
     tag: str
 
 
+def viewer_is_built(folder: Path = STATIC) -> bool:
+    """Whether the built files are there."""
+    return (folder / INDEX).is_file()
+
+
 def load_assets(folder: Path = STATIC) -> dict[str, Asset]:
     """Read the built files, by their path below the folder; none where the viewer is not built."""
-    if not (folder / INDEX).is_file():
+    if not viewer_is_built(folder):
         return {}
     return {path.relative_to(folder).as_posix(): _load(path, folder) for path in folder.rglob("*") if path.is_file()}
 

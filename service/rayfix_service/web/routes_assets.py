@@ -6,6 +6,7 @@ from fastapi import APIRouter, Request, Response
 from starlette.exceptions import HTTPException
 
 from rayfix_service.web.assets import INDEX, INTERFACE, SECURITY_HEADERS, Asset, load_assets
+from rayfix_service.web.plain_interface import plain_interface
 
 router = APIRouter(include_in_schema=False)
 
@@ -15,9 +16,9 @@ _NOT_BUILT = """\
 <meta charset="utf-8">
 <title>rayfix</title>
 <h1>rayfix</h1>
-<p>The service runs, but its pages are not built. With Node.js 20.19 or later, run <code>make viewer</code> in the
-checkout and start the service again. Installed packages have them.
-<p><a href="openapi.json">The OpenAPI document of the HTTP interface</a>
+<p>The service runs, but this installation is without the viewer, as there was no Node.js 20.19 or later when it was
+made. With that, run <code>make viewer</code> in the checkout, or install rayfix again, and start the service again.
+<p><a href="docs">The HTTP interface</a>, and <a href="openapi.json">its OpenAPI document</a>
 </html>
 """
 
@@ -30,13 +31,15 @@ def _assets() -> dict[str, Asset]:
 @router.api_route("/", methods=["GET", "HEAD"])
 async def get_viewer(request: Request) -> Response:
     """Give the viewer's page."""
-    return _page(request, INDEX)
+    asset = _assets().get(INDEX)
+    return _plain(_NOT_BUILT) if asset is None else _answer(request, asset)
 
 
 @router.api_route("/docs", methods=["GET", "HEAD"])
 async def get_interface(request: Request) -> Response:
     """Give the page that shows the OpenAPI document."""
-    return _page(request, INTERFACE)
+    asset = _assets().get(INTERFACE)
+    return _plain(plain_interface(request.app.openapi())) if asset is None else _answer(request, asset)
 
 
 @router.api_route("/assets/{name:path}", methods=["GET", "HEAD"])
@@ -51,11 +54,8 @@ async def get_interface_file(request: Request, name: str) -> Response:
     return _file(request, f"interface/{name}")
 
 
-def _page(request: Request, name: str) -> Response:
-    asset = _assets().get(name)
-    if asset is None:
-        return Response(_NOT_BUILT, media_type="text/html", headers={**SECURITY_HEADERS, "Cache-Control": "no-cache"})
-    return _answer(request, asset)
+def _plain(page: str) -> Response:
+    return Response(page, media_type="text/html", headers={**SECURITY_HEADERS, "Cache-Control": "no-cache"})
 
 
 def _file(request: Request, name: str) -> Response:

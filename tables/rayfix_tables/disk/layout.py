@@ -5,7 +5,9 @@ process that read it (see :mod:`rayfix_tables.checking`) to those that answer fr
 HDF5 or hold it for ever.
 """
 
+import errno
 import math
+import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -33,6 +35,15 @@ from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATabl
 _MOST_ATTRIBUTES = 64  # of one object; a station has 14
 _LEAST_OBJECT_BYTES = 16
 _LONGEST_ARRAY = 1024  # of an attribute; the coverage of a station is the longest
+_OF_THE_SYSTEM = frozenset(
+    {
+        errno.EACCES, errno.EAGAIN, errno.EBUSY, errno.EHOSTDOWN, errno.EINTR, errno.EIO, errno.EMFILE, errno.ENFILE,
+        errno.ENODEV, errno.ENOLCK, errno.ENOSYS, errno.ENOTCONN, errno.ENOTSUP, errno.ENXIO, errno.EPERM,
+        errno.EREMOTEIO, errno.ESTALE, errno.ETIMEDOUT,
+    }
+)  # fmt: skip
+"""Errors of disks, networks and rights, which say nothing of what is in the file."""
+
 _STATION = re.compile(r"stations/[^/]+\Z")
 _LEVEL = re.compile(r"stations/[^/]+/levels/(0|[1-9][0-9]{0,3})\Z")
 _OF_SCENE = {**SCENE_DATASETS, **TEXT_DATASETS}
@@ -123,10 +134,18 @@ def damage_reported(path: Path) -> Iterator[None]:
         raise TableError(
             f"{path} cannot be read: there is not enough memory for it; free some, or use a larger machine"
         ) from error
-    except (KeyError, OSError, OverflowError, RuntimeError, SystemError, ValueError) as error:
-        raise CorruptTableError(
-            f"{path} is damaged: {_one_line(error)}; restore it from a copy or build it again"
-        ) from error
+    except OSError as error:
+        if error.errno in _OF_THE_SYSTEM:
+            raise TableError(
+                f"{path} cannot be read ({os.strerror(error.errno)}); see whether its disk is there, then try again"
+            ) from error
+        raise _damage(path, error) from error
+    except (KeyError, OverflowError, RuntimeError, SystemError, ValueError) as error:
+        raise _damage(path, error) from error
+
+
+def _damage(path: Path, error: Exception) -> CorruptTableError:
+    return CorruptTableError(f"{path} is damaged: {_one_line(error)}; restore it from a copy or build it again")
 
 
 def read_layout(opened: OpenFile) -> FileLayout:
@@ -145,8 +164,9 @@ def read_layout(opened: OpenFile) -> FileLayout:
         When it is not as rayfix writes it.
     """
     path = opened.path
-    # By its descriptor: another file may have its name by now.
-    with h5py.File(f"/dev/fd/{opened.descriptor}", "r") as file:
+    # By its descriptor: another file may have its name by now. Without a lock, which some file systems do not have and
+    # another program may hold: a table never changes in place.
+    with h5py.File(f"/dev/fd/{opened.descriptor}", "r", locking=False) as file:
         # Texts in a heap may keep HDF5 busy for ever, so that files of this version must not have any.
         reader = _Reader(size=opened.size, in_heaps=_whole_number(file, "format_version") != FORMAT_VERSION)
         root = reader.attributes_of(file.id, "")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from rayfix_offline.fit.cells import assemble_level, fit_cells
-from rayfix_offline.fit.normalise import balanced
+from rayfix_offline.fit.normalise import balanced, balancing_steps
 from rayfix_offline.fit.settings import TubeFit
 from rayfix_offline.site import parse_site
 from rayfix_tables.freespace import FreeSpace
@@ -147,3 +147,11 @@ def test_a_component_without_a_covariance_keeps_its_weight() -> None:
     found = balanced(broken, open_space()).log_balance
     assert found[1] == 0.0
     assert found[0] == pytest.approx(balanced(alone, open_space()).log_balance[0], abs=1e-6)
+
+
+def test_balancing_reports_all_of_its_steps_as_they_are_taken() -> None:
+    level = level_of(np.full((3, 3), 4.0), np.ones(3), log_mass=3.0)
+    steps: list[int] = []
+    balanced(level, open_space(), advance=steps.append)
+    assert sum(steps) == balancing_steps(level)
+    assert max(steps) <= 3

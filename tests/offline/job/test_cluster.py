@@ -52,16 +52,19 @@ class Processes:
             assert time.monotonic() < deadline, "the scheduler did not start"
             time.sleep(0.05)
 
-    def _start(self, module: str, *options: str) -> "subprocess.Popen[bytes]":
-        command = [sys.executable, "-m", f"distributed.cli.{module}", "--scheduler-file", str(self.file), *options]
+    def _start(self, module: str, *options: str, before: str = "") -> "subprocess.Popen[bytes]":
+        script = f"{before}\nfrom distributed.cli.{module} import main\nmain()"
+        command = [sys.executable, "-c", script, "--scheduler-file", str(self.file), *options]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         self._stack.callback(process.wait)
         self._stack.callback(process.kill)
         return process
 
-    def worker(self) -> "subprocess.Popen[bytes]":
-        """Start one more worker."""
-        return self._start("dask_worker", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
+    def worker(self, before: str = "") -> "subprocess.Popen[bytes]":
+        """Start one more worker, which first runs some code."""
+        return self._start(
+            "dask_worker", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1", before=before
+        )
 
     def address(self, workers: int) -> str:
         """Wait for workers and return the scheduler's address."""
@@ -123,3 +126,54 @@ def test_a_scheduler_without_workers(site: Path, tmp_path: Path, processes: Proc
     address = processes.address(workers=0)
     with pytest.raises(BuildError, match=r"has no workers; start some with 'dask worker tcp://127"):
         build_table(site, tmp_path / "t.h5", cluster=address)
+
+
+WITHOUT_RAYFIX = "import sys\nfor name in ('tables', 'offline'): sys.modules[f'rayfix_{name}'] = None"
+OTHER_VERSION = "import rayfix_tables.version as version\nversion.software_version = lambda: '9.9'"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize(
+    ("before", "why"),
+    [
+        (WITHOUT_RAYFIX, r"it has no rayfix \(.*rayfix_tables.*\); install rayfix"),
+        (OTHER_VERSION, r"it has rayfix 9\.9, not"),
+    ],
+)
+def test_workers_without_this_rayfix_are_refused(
+    site: Path, tmp_path: Path, processes: Processes, before: str, why: str
+) -> None:
+    processes.worker(before)
+    address = processes.address(workers=1)
+    with pytest.raises(BuildError, match=rf"no worker with rayfix \S+ is left at tcp://\S+ \({why}") as caught:
+        build_table(site, tmp_path / "t.h5", cluster=address)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_a_build_goes_on_with_those_that_have_it_and_ends_when_none_is_left(
+    site: Path,
+    tmp_path: Path,
+    processes: Processes,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr("rayfix_offline.job.cluster.LOOK_SECONDS", 0.2)
+    monkeypatch.setattr("rayfix_offline.job.cluster_workers.LEFT_SECONDS", 1.0)
+    processes.worker(WITHOUT_RAYFIX)
+    only = processes.worker()
+    address = processes.address(workers=2)
+    blocks = 0
+
+    def kill_the_only_one(stage: str, done: int, total: int) -> None:
+        nonlocal blocks
+        blocks += "cells" in stage
+        if blocks == 2:
+            only.kill()
+
+    with pytest.raises(BuildError, match=r"is left at tcp://\S+ .*finished blocks are kept"):
+        build_table(site, tmp_path / "t.h5", cluster=address, progress=kill_the_only_one)
+    assert blocks >= 2
+    assert sum("gets no work: it has no rayfix" in record.getMessage() for record in caplog.records) == 1

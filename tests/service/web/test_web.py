@@ -15,7 +15,7 @@ import trimesh
 from rayfix.example.drop import EXAMPLE_POSITION, example_paths
 from rayfix_service.http.answering.table_cache import TableCache
 from rayfix_service.locator import Locator
-from rayfix_service.web import assets
+from rayfix_service.web import assets, routes_assets
 from rayfix_service.web.documents import MixtureDocument, mixture_document
 from rayfix_service.web.glb import NO_MATERIAL, write_glb
 from rayfix_service.web.inspector import mass_by_reflections, view_direction
@@ -292,6 +292,15 @@ def test_a_page_and_its_files_are_strict_and_cached(web: RunningApp, address: st
     assert response.headers["content-encoding"] == "gzip"
     assert web.get(f"/{folder}/../index.html").status_code == 404
     assert web.get(f"/{folder}/nothing.js").status_code == 404
+
+
+def test_without_built_files_the_interface_is_a_plain_page(web: RunningApp, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(routes_assets, "_assets", dict)
+    viewer, interface = web.get("/"), web.get("/docs")
+    assert "without the viewer" in viewer.text
+    assert "POST /v1/positions" in interface.text
+    for page in (viewer, interface):
+        assert page.headers["content-security-policy"].startswith("default-src 'none'")
 
 
 def test_the_built_files_are_below_a_megabyte():

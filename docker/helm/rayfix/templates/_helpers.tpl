@@ -32,7 +32,11 @@ helm.sh/chart: {{ .Chart.Name }}-{{ .Chart.Version }}
 {{- if eq .Values.table.source "url" -}}
 {{ .Values.table.id | trunc 12 }}
 {{- else -}}
-{{ printf "%s %s" (toJson .Values.site) (include "rayfix.image" (list . .Values.images.offline)) | sha256sum | trunc 12 }}
+{{- /* Addresses of files do not count, as signed ones change; their hashes do. */}}
+{{- $files := list -}}
+{{- range .Values.site.files }}{{ $files = append $files (list .name .sha256) }}{{ end -}}
+{{- $site := merge (dict "files" $files) (omit .Values.site "files") -}}
+{{ printf "%s %s" (toJson $site) (include "rayfix.image" (list . .Values.images.offline)) | sha256sum | trunc 12 }}
 {{- end }}
 {{- end }}
 

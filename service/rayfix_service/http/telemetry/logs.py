@@ -71,7 +71,8 @@ def log_config(log_format: LogFormat, *, access_log: bool) -> dict[str, Any]:
         config["formatters"] = {name: {"()": _name_of(JsonFormatter)} for name in config["formatters"]}
     else:
         config["formatters"]["default"]["()"] = _name_of(TextFormatter)
-    config["loggers"]["rayfix_service"] = {"handlers": ["default"], "level": "INFO", "propagate": False}
+    for name in ("rayfix", "rayfix_service"):
+        config["loggers"][name] = {"handlers": ["default"], "level": "INFO", "propagate": False}
     config["loggers"][ACCESS_LOGGER] = {"level": "INFO" if access_log else "WARNING"}
     return config
 

@@ -1,0 +1,60 @@
+"""Says on the log when kernels of rayfix are compiled.
+
+numba compiles a kernel when it is first called and says nothing of it. After an installation that takes a minute, on a
+busy machine several. What is on disk already is loaded and not announced.
+"""
+
+import logging
+import time
+
+from numba.core import event
+
+_AGAIN_SECONDS = 10.0
+"""Time between two messages."""
+
+_log = logging.getLogger("rayfix")
+
+
+class _Announcer(event.Listener):  # type: ignore[misc]
+    """Follows compilations, one at a time: numba holds a lock during each."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._begin = 0.0
+        self._last: float | None = None
+
+    def on_start(self, event: event.Event) -> None:
+        """Announce the first compilation; kernels that a kernel calls are compiled within it."""
+        if not _is_own(event):
+            return
+        if self._last is None:
+            self._begin = self._last = time.monotonic()
+            _log.warning("compiling kernels, once; this takes a minute or two and longer on a busy machine")
+
+    def on_end(self, event: event.Event) -> None:
+        """Count, and from time to time tell the number."""
+        if not _is_own(event) or self._last is None:
+            return
+        self._count += 1
+        now = time.monotonic()
+        if now - self._last >= _AGAIN_SECONDS:
+            self._last = now
+            _log.warning("compiling kernels: %d compiled in %.0f s", self._count, now - self._begin)
+
+
+def _is_own(event: event.Event) -> bool:
+    """Whether a kernel is one of rayfix."""
+    module = getattr(event.data["dispatcher"].py_func, "__module__", "") or ""
+    return module.startswith("rayfix_")
+
+
+_announcer = _Announcer()
+_registered = False
+
+
+def announce_compilation() -> None:
+    """Have compilations of rayfix's kernels announced from now on."""
+    global _registered
+    if not _registered:
+        _registered = True
+        event.register("numba:compile", _announcer)
