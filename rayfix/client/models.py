@@ -90,13 +90,19 @@ class FixEvent:
 
 @dataclass(frozen=True, kw_only=True)
 class StationAnswer:
-    """A station; angles are its orientation as in 3GPP TR 38.901."""
+    """A station; bearing, downtilt and slant are its orientation as in 3GPP TR 38.901.
+
+    ``boresight_azimuth_deg`` and ``boresight_downtilt_deg`` are where its array looks, ``mounting`` is its local frame.
+    """
 
     id: str
     position: Point
     bearing_deg: float
     downtilt_deg: float
     slant_deg: float
+    mounting: str
+    boresight_azimuth_deg: float
+    boresight_downtilt_deg: float
     field_of_view_deg: float
 
 
@@ -166,6 +172,9 @@ def station_answers(document: Mapping[str, Any]) -> tuple[StationAnswer, ...]:
             bearing_deg=one["orientation"]["bearing_deg"],
             downtilt_deg=one["orientation"]["downtilt_deg"],
             slant_deg=one["orientation"]["slant_deg"],
+            mounting=one["mounting"],
+            boresight_azimuth_deg=one["boresight"]["azimuth_deg"],
+            boresight_downtilt_deg=one["boresight"]["downtilt_deg"],
             field_of_view_deg=one["field_of_view_deg"],
         )
         for one in document["stations"]

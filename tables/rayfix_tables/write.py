@@ -29,7 +29,7 @@ from rayfix_tables.errors import RayfixError, TableError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES
-from rayfix_tables.site import SiteInfo
+from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.update import Update
 
 
@@ -205,6 +205,8 @@ def _write_content(
         group.attrs["position_m"] = np.asarray(station.position)
         group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
         group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
+        if station.mounting != Station.mounting:  # or tables of older versions would change
+            group.attrs["mounting"] = station.mounting
         for name, value in bias_attributes(station.bias).items():
             group.attrs[name] = value
         group.attrs["part_id"] = content.part_id

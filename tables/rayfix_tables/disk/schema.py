@@ -3,14 +3,14 @@
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, cast, get_args
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
-from rayfix_tables.site import NO_BIAS, StationBias
+from rayfix_tables.site import NO_BIAS, Mounting, Station, StationBias
 
 FORMAT = "rayfix-table"
 FORMAT_VERSION = 1
@@ -65,6 +65,15 @@ def read_bias(attributes: Mapping[str, Any]) -> StationBias:
         zenith=zenith,
         angle_stdev=angle_stdev,
     )
+
+
+def read_mounting(attributes: Mapping[str, Any]) -> Mounting:
+    """Local frame of a station's array from the attributes of its group; that of 3GPP where it is missing."""
+    mounting = attributes.get("mounting", Station.mounting)
+    for known in get_args(Mounting):
+        if mounting == known:
+            return cast("Mounting", known)
+    raise ValueError(f"mounting is {mounting!r}; this version knows {', '.join(get_args(Mounting))}")
 
 
 def array_digest(array: NDArray[Any]) -> str:

@@ -211,6 +211,9 @@ def test_the_stations_are_listed(hall_app: RunningApp, hall_table_path: Path):
         part = table.parts[station["id"]]
         assert tuple(station["position"].values()) == part.station.position
         assert list(station["orientation"]) == ["bearing_deg", "downtilt_deg", "slant_deg"]
+        assert station["mounting"] == "3gpp"
+        assert station["boresight"]["azimuth_deg"] == pytest.approx(station["orientation"]["bearing_deg"])
+        assert station["boresight"]["downtilt_deg"] == pytest.approx(station["orientation"]["downtilt_deg"])
         assert station["field_of_view_deg"] == pytest.approx(math.degrees(part.station.field_of_view))
         assert [level["num_cells"] for level in station["levels"]] == [level.num_cells for level in part.levels]
         windows = [level["window_deg"] for level in station["levels"]]
