@@ -77,6 +77,7 @@ class FixAnswer:
     compute_ms: float
     track: TrackAnswer | None
     simplified: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,6 +156,7 @@ def fix_answer(document: Mapping[str, Any]) -> FixAnswer:
         compute_ms=float(document["compute_ms"]),
         track=None if track is None else _track(track),
         simplified=tuple(document.get("simplified", ())),
+        warnings=tuple(document.get("warnings", ())),
     )
 
 

@@ -1,9 +1,12 @@
 """The face of the fusion: a table and a report in, a fix out."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rayfix_service.fusion.diagnosis.suspects import suspects
+from rayfix_service.fusion.diagnosis.turned import find_turns, turn_warning, turned_report
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
 from rayfix_service.fusion.measurements.report import Angle, Range, Report
 from rayfix_service.fusion.posterior.credible import CredibleRegions
@@ -18,6 +21,7 @@ from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_pri
 from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
+from rayfix_tables.site import SiteInfo
 from rayfix_tables.table import Table
 
 _NO_RAYS = "no ray of station '{}' comes from that direction"
@@ -69,10 +73,34 @@ class Locator:
         FixStoppedError
             When it was stopped.
         """
-        return make_fix(report, self._product(report, stop), self.table, self.settings, stop)
+        return self.explain(report, self.fuse(report, stop=stop).fix, stop=stop)
+
+    def explain(self, report: Report, fix: Fix, *, stop: Stop = NEVER) -> Fix:
+        """Search the stations of an inconsistent report for a constant turn of their angles, and warn of it.
+
+        :meth:`locate` does it at once. The search takes at most ``FusionSettings.most_turn_fixes`` further fixes, and
+        none for a fix of another status.
+
+        Parameters
+        ----------
+        report : Report
+        fix : Fix
+            Of that report.
+        stop : Stop
+            As of :meth:`locate`.
+        """
+        if fix.status != "inconsistent" or self.settings.most_turn_fixes == 0:
+            return fix
+
+        def relocate(changed: Report, turns: Mapping[str, float]) -> Fix:
+            changed, site = turned_report(changed, self.table.site, turns)
+            return make_fix(changed, self._product(changed, site, stop), self.table, self.settings, stop)
+
+        turns = find_turns(report, fix, self.table.site, relocate, most_fixes=self.settings.most_turn_fixes)
+        return replace(fix, warnings=(*fix.warnings, turn_warning(turns))) if turns else fix
 
     def fuse(self, report: Report, *, stop: Stop = NEVER) -> "Fused":
-        """Locate a report and keep what its fix was made of, for filters that go on with it.
+        """Locate a report and keep what its fix was made of, for filters that go on with it; does not :meth:`explain`.
 
         Parameters
         ----------
@@ -80,8 +108,10 @@ class Locator:
         stop : Stop
             As of :meth:`locate`, and so are the errors.
         """
-        product = self._product(report, stop)
+        product = self._product(report, self.table.site, stop)
         fix = make_fix(report, product, self.table, self.settings, stop)
+        if fix.status == "inconsistent":
+            fix = replace(fix, warnings=(suspects(report, fix),))
         return Fused(fix=fix, hypotheses=product.hypotheses, prior=product.prior)
 
     def posterior(self, report: Report, *, stop: Stop = NEVER) -> Posterior:
@@ -93,7 +123,7 @@ class Locator:
         stop : Stop
             As of :meth:`locate`, and so are the errors.
         """
-        product = self._product(report, stop)
+        product = self._product(report, self.table.site, stop)
         return make_posterior(product.hypotheses, product.prior, self.table.scene.free_space, stop)
 
     def seconds(self, report: Report) -> float:
@@ -118,9 +148,9 @@ class Locator:
         regions.upright_ellipsoid(0.5)
         _ = regions.accuracies(0.5).ellipsoid.semi_axes
 
-    def _product(self, report: Report, stop: Stop) -> Product:
-        """Multiply what the measurements say."""
-        sorted_report = sort_report(report, self.table.site)
+    def _product(self, report: Report, site: SiteInfo, stop: Stop) -> Product:
+        """Multiply what the measurements say, by the stations of a site."""
+        sorted_report = sort_report(report, site)
         free_space = self.table.scene.free_space
         prior = self._uniform_prior if report.height is None else height_prior(report.height, free_space)
         unused = dict(sorted_report.unused)

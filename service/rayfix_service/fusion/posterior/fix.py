@@ -74,6 +74,9 @@ class Fix:
         Probability that the report wants regions of.
     simplified : tuple of str
         What was worked out more coarsely than the report says, since the work per report is bounded; mostly empty.
+    warnings : tuple of str
+        Of an inconsistent fix: which measurements contradict the others, and which turn of stations would make them
+        agree.
     """
 
     status: Status
@@ -84,6 +87,7 @@ class Fix:
     regions: "CredibleRegions | None" = None
     confidence: float = CONFIDENCE
     simplified: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     target_id: str | None = None
     timestamp: str | None = None
 

@@ -77,6 +77,8 @@ export interface Fix {
   confidence: number;
   candidates: Candidate[];
   measurements: Outcome[];
+  /** Of an inconsistent fix; absent otherwise. */
+  warnings?: string[];
   table_id: string;
   compute_ms: number;
 }
