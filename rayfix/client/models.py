@@ -34,12 +34,21 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """Result for one measurement; ``reason`` says why it was not used."""
+    """Result for one measurement; ``reason``: why it was not used, ``source``: where it stands in another message."""
 
     index: int
     used: bool
     outlier_probability: float | None
     reason: str | None
+    source: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkippedMeasurement:
+    """A measurement of another system's message that no fix can use."""
+
+    source: str
+    reason: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +69,7 @@ class TrackAnswer:
 
 @dataclass(frozen=True, kw_only=True)
 class FixAnswer:
-    """The answer to a report; ``track`` is there where the service follows targets."""
+    """The answer to a report; ``track`` is there where the service follows targets, ``skipped`` of another message."""
 
     status: Status
     target_id: str | None
@@ -78,6 +87,7 @@ class FixAnswer:
     track: TrackAnswer | None
     simplified: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    skipped: tuple[SkippedMeasurement, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,6 +159,7 @@ def fix_answer(document: Mapping[str, Any]) -> FixAnswer:
                 used=bool(one["used"]),
                 outlier_probability=one["outlier_probability"],
                 reason=one.get("reason"),
+                source=one.get("source"),
             )
             for one in document["measurements"]
         ),
@@ -157,6 +168,9 @@ def fix_answer(document: Mapping[str, Any]) -> FixAnswer:
         track=None if track is None else _track(track),
         simplified=tuple(document.get("simplified", ())),
         warnings=tuple(document.get("warnings", ())),
+        skipped=tuple(
+            SkippedMeasurement(source=one["source"], reason=one["reason"]) for one in document.get("skipped", ())
+        ),
     )
 
 

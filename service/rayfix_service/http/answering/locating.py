@@ -194,7 +194,10 @@ class Answerer:
         site = table.site
         if self.hub is not None:
             self.hub.tell(fix, site, track)
-        return write(fix, options.output, site, compute_seconds=seconds, adapted=incoming.adapted, track=track)
+        answer = write(fix, options.output, site, compute_seconds=seconds, adapted=incoming.adapted, track=track)
+        if options.with_report and options.output == "native":
+            answer["report"] = incoming.native_document()
+        return answer
 
     async def answer_or_problem(
         self, table: ServedTable, make: Callable[[], Incoming | Awaitable[Incoming]], options: ResponseOptions
