@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: client coverage viewer viewer-test browser screenshots demo lock test test-kernels test-portable lint types package images accuracy openapi clean
+.PHONY: mountings client coverage viewer viewer-test browser screenshots demo lock test test-kernels test-portable lint types package images accuracy openapi clean
 
 # pip takes what builds the package from these too: under the first name until 25.2, under the second from 25.3 on.
 PINNED := PIP_CONSTRAINT=$(CURDIR)/constraints.txt PIP_BUILD_CONSTRAINT=$(CURDIR)/constraints.txt
@@ -36,6 +36,10 @@ viewer-test:
 	else \
 		echo "the viewer's own tests are left out: they need npm and Node.js 20.19 or later"; \
 	fi
+
+# The documentation's drawings of how arrays are mounted.
+mountings: $(VENV)/.done
+	$(BIN)/python tools/draw_mountings.py
 
 # The documentation's pictures, of the demo's table.
 screenshots: demo viewer

@@ -199,6 +199,9 @@ def print_fix(document: Mapping[str, Any]) -> None:
     """Print the answer to a report."""
     if document["position"] is None:
         print(f"{document['status']}: no measurement could be used")
+    elif document["status"] == "inconsistent":
+        # Probabilities hold for measurements that the model is of, which these are not.
+        print(f"inconsistent: {place(document['position'])} is only the best guess")
     else:
         print(f"{document['status']}: {place(document['position'])}")
         print(
@@ -208,10 +211,12 @@ def print_fix(document: Mapping[str, Any]) -> None:
         for n, candidate in enumerate(document["candidates"]):
             name = "this position" if n == 0 else f"rival {n}: {place(candidate['position'])},"
             print(f"  {name} has a probability of {candidate['probability']:.1%}")
+    for warning in document.get("warnings", ()):
+        print(f"  {warning}")
     for outcome in document["measurements"]:
         if not outcome["used"]:
             print(f"  measurement {outcome['index']} not used: {outcome['reason']}")
-        elif outcome["outlier_probability"] > 0.5:
+        elif outcome["outlier_probability"] > 0.5 and "warnings" not in document:
             print(f"  measurement {outcome['index']} is an outlier ({outcome['outlier_probability']:.0%})")
 
 

@@ -21,6 +21,7 @@ def locate_file(
     output_format: OutputFormat = "native",
     stations: Mapping[str, str] | None = None,
     height: Height | None = None,
+    confidence: float | None = None,
 ) -> list[dict[str, Any]]:
     """Answer a file as the HTTP interface does: with one position, or with one for each epoch of u-blox lines.
 
@@ -33,6 +34,8 @@ def locate_file(
         Stations by the names that the file has for them; a native report has the table's own.
     height : Height, optional
         Prior of the target's height, for reports without one.
+    confidence : float, optional
+        Probability with which accuracies are to hold, instead of the report's.
 
     Raises
     ------
@@ -52,7 +55,7 @@ def locate_file(
     locator = Locator(table)
     answers = []
     try:
-        for adapted in parse(body, input_format, stations=stations, height=height):
+        for adapted in parse(body, input_format, stations=stations, height=height, confidence=confidence):
             begin = time.perf_counter()
             try:
                 fix = locator.locate(adapted.report)

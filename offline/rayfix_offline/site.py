@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from rayfix_tables.errors import SiteError
+from rayfix_tables.mounting import Boresight, boresight_of, orientation_of
 from rayfix_tables.problems import path_text
-from rayfix_tables.site import SiteInfo, Station, StationBias
+from rayfix_tables.site import Mounting, SiteInfo, Station, StationBias
 
 MIN_WINDOW_RATIO = 1.5
 """Smallest ratio of a window to the one before: its cells are sums of finer cells, which must add up to its window."""
@@ -24,6 +25,8 @@ WINDOWS_PATH = "write Windows paths with / or in single quotes; in double quotes
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Coordinate = Annotated[float, Field(ge=-LARGEST_COORDINATE, le=LARGEST_COORDINATE)]
 Triple = tuple[Finite, Finite, Finite]
+
+_BORESIGHT_KEYS = ("boresight_azimuth_deg", "boresight_downtilt_deg", "roll_deg")
 
 
 class _Section(BaseModel):
@@ -93,13 +96,62 @@ class StationSection(_Section):
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}$")]
     position_m: tuple[Coordinate, Coordinate, Coordinate]
-    orientation_deg: Triple = (0.0, 0.0, 0.0)
+    mounting: Mounting = "3gpp"
+    boresight_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
+    boresight_downtilt_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    roll_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
+    orientation_deg: Triple | None = None
     field_of_view_deg: Annotated[float, Field(gt=0, le=360)] = 360.0
     bias: BiasSection = BiasSection()
 
+    @model_validator(mode="after")
+    def _turned_once(self) -> "StationSection":
+        given = [key for key in _BORESIGHT_KEYS if getattr(self, key) is not None]
+        if given and self.orientation_deg is not None:
+            raise ValueError(
+                f"orientation_deg and {', '.join(given)} both say how the array is turned; give one of them: "
+                "the boresight, or the orientation of 3GPP TR 38.901"
+            )
+        return self
+
+    def station(self) -> Station:
+        """Return the station as the table stores it."""
+        if self.orientation_deg is None:
+            azimuth, downtilt, roll = (float(np.deg2rad(getattr(self, key) or 0.0)) for key in _BORESIGHT_KEYS)
+            orientation = orientation_of(self.mounting, Boresight(azimuth, downtilt), roll)
+        else:
+            orientation = _radians(self.orientation_deg)
+        bias = self.bias
+        return Station(
+            id=self.id,
+            position=self.position_m,
+            orientation=orientation,
+            field_of_view=float(np.deg2rad(self.field_of_view_deg)),
+            bias=StationBias(
+                range=bias.range_m,
+                range_stdev=bias.range_stdev_m,
+                azimuth=float(np.deg2rad(bias.azimuth_deg)),
+                zenith=float(np.deg2rad(bias.zenith_deg)),
+                angle_stdev=float(np.deg2rad(bias.angle_stdev_deg)),
+            ),
+            mounting=self.mounting,
+        )
+
     def built_from(self) -> dict[str, Any]:
-        """Return what the station's part of the table depends on: all but the bias, which the fusion subtracts."""
-        return self.model_dump(mode="json", exclude={"bias"})
+        """Return what the station's part of the table depends on: position and field of view.
+
+        The fusion subtracts the bias and turns the angles. So the orientation counts only where not all directions are
+        in view, and then only where the boresight points: as the orientation of a frame that has it as its x axis.
+        """
+        looks = [0.0, 0.0, 0.0]
+        if self.field_of_view_deg < 360.0:
+            looks = [*(round(float(angle), 9) for angle in np.rad2deg(boresight_of(self.station()))), 0.0]
+        return {
+            "id": self.id,
+            "position_m": list(self.position_m),
+            "orientation_deg": looks,
+            "field_of_view_deg": self.field_of_view_deg,
+        }
 
 
 class SiteFile(_Section):
@@ -136,23 +188,8 @@ class SiteFile(_Section):
             name=self.site.name,
             north=float(np.deg2rad(self.site.north_deg)),
             max_path_length=self.propagation.max_path_length_m,
-            stations=tuple(
-                Station(
-                    id=s.id,
-                    position=s.position_m,
-                    orientation=_radians(s.orientation_deg),
-                    field_of_view=float(np.deg2rad(s.field_of_view_deg)),
-                    bias=StationBias(
-                        range=s.bias.range_m,
-                        range_stdev=s.bias.range_stdev_m,
-                        azimuth=float(np.deg2rad(s.bias.azimuth_deg)),
-                        zenith=float(np.deg2rad(s.bias.zenith_deg)),
-                        angle_stdev=float(np.deg2rad(s.bias.angle_stdev_deg)),
-                    ),
-                )
-                for s in self.stations
-            ),
-            document=self.model_dump(mode="json"),
+            stations=tuple(section.station() for section in self.stations),
+            document=self.model_dump(mode="json", exclude_none=True),
         )
 
 

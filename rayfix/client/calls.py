@@ -9,10 +9,11 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from random import Random
 from typing import Any, TypeVar
+from urllib.parse import urlencode
 
 from rayfix.client.models import FixAnswer, fix_answer
 from rayfix.client.retries import RetryPolicy, is_temporary
-from rayfix.errors import AnswerError, ProblemError, ProblemField, RefusedReportError, UnreachableError
+from rayfix.errors import AnswerError, ClientError, ProblemError, ProblemField, RefusedReportError, UnreachableError
 
 T = TypeVar("T")
 
@@ -21,6 +22,9 @@ BATCH_REPORTS = 1000
 
 BATCH_BYTES = 8 << 20
 """Bytes of one batch; the service accepts twice as many."""
+
+MESSAGE_FORMATS = ("nrppa", "silabs")
+"""Formats of other systems' messages that are JSON."""
 
 _REPORT_PROBLEMS = frozenset({"urn:rayfix:problem:invalid-report", "urn:rayfix:problem:malformed-json"})
 _JSON = {"content-type": "application/json"}
@@ -158,19 +162,58 @@ def position_call(report: Any, query: Mapping[str, str]) -> Call:
     return Call(method="POST", path="/v1/positions", query=query, headers=headers, body=report_bytes(report))
 
 
-def batch_calls(reports: Iterable[Any], query: Mapping[str, str]) -> Iterator[tuple[int, Call]]:
-    """Split reports into batches that the service accepts; yields each with the number of its reports."""
+def batch_calls(
+    reports: Iterable[Any], query: Mapping[str, str], message_format: str | None = None
+) -> Iterator[tuple[int, Call]]:
+    """Split reports, or messages of a format, into batches that the service accepts; yields each with its number."""
+    path = "/v1/positions/batch" if message_format is None else f"/v1/positions/{_named(message_format)}/batch"
     batch: list[bytes] = []
     size = 0
     for report in reports:
         text = report_bytes(report)
         if batch and (len(batch) == BATCH_REPORTS or size + len(text) > BATCH_BYTES):
-            yield len(batch), _batch_call(batch, query)
+            yield len(batch), _batch_call(path, batch, query)
             batch, size = [], 0
         batch.append(text)
         size += len(text) + 1
     if batch:
-        yield len(batch), _batch_call(batch, query)
+        yield len(batch), _batch_call(path, batch, query)
+
+
+def message_call(message: Mapping[str, Any], message_format: str, query: Mapping[str, str]) -> Call:
+    """Call for the position of another system's message of JSON."""
+    path = f"/v1/positions/{_named(message_format)}"
+    return Call(method="POST", path=path, query=query, headers=_JSON, body=report_bytes(message))
+
+
+def lines_call(
+    lines: str,
+    query: Mapping[str, str],
+    *,
+    stations: Mapping[str, str] | None,
+    height: tuple[float, float] | None,
+    confidence: float | None,
+) -> Call:
+    """Call for the positions of u-blox lines; a height is z and its standard deviation, m."""
+    pairs = [(key, value) for key, value in query.items()]
+    pairs += [("station", f"{anchor}={station}") for anchor, station in (stations or {}).items()]
+    if height is not None:
+        pairs += [("height_m", repr(height[0])), ("height_stdev_m", repr(height[1]))]
+    if confidence is not None:
+        pairs.append(("confidence", repr(confidence)))
+    path = f"/v1/positions/ublox?{urlencode(pairs)}" if pairs else "/v1/positions/ublox"
+    return Call(method="POST", path=path, headers={"content-type": "text/plain"}, body=lines.encode())
+
+
+def lines_answers(document: Any) -> list[FixAnswer | ProblemError]:
+    """Read the answers to lines, as many as there are."""
+    return list(batch_answers(document, len(document["results"])))
+
+
+def _named(message_format: str) -> str:
+    if message_format not in MESSAGE_FORMATS:
+        raise ClientError(f"format {message_format!r} is none of {', '.join(MESSAGE_FORMATS)}; u-blox has locate_lines")
+    return message_format
 
 
 def batch_answers(document: Any, count: int) -> tuple[FixAnswer | ProblemError, ...]:
@@ -189,6 +232,6 @@ def batch_answers(document: Any, count: int) -> tuple[FixAnswer | ProblemError, 
     return tuple(answers)
 
 
-def _batch_call(batch: list[bytes], query: Mapping[str, str]) -> Call:
+def _batch_call(path: str, batch: list[bytes], query: Mapping[str, str]) -> Call:
     body = b'{"reports":[' + b",".join(batch) + b"]}"
-    return Call(method="POST", path="/v1/positions/batch", query=query, headers=_JSON, body=body)
+    return Call(method="POST", path=path, query=query, headers=_JSON, body=body)

@@ -34,12 +34,21 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """Result for one measurement; ``reason`` says why it was not used."""
+    """Result for one measurement; ``reason``: why it was not used, ``source``: where it stands in another message."""
 
     index: int
     used: bool
     outlier_probability: float | None
     reason: str | None
+    source: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkippedMeasurement:
+    """A measurement of another system's message that no fix can use."""
+
+    source: str
+    reason: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +69,7 @@ class TrackAnswer:
 
 @dataclass(frozen=True, kw_only=True)
 class FixAnswer:
-    """The answer to a report; ``track`` is there where the service follows targets."""
+    """The answer to a report; ``track`` is there where the service follows targets, ``skipped`` of another message."""
 
     status: Status
     target_id: str | None
@@ -77,6 +86,8 @@ class FixAnswer:
     compute_ms: float
     track: TrackAnswer | None
     simplified: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    skipped: tuple[SkippedMeasurement, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,13 +101,19 @@ class FixEvent:
 
 @dataclass(frozen=True, kw_only=True)
 class StationAnswer:
-    """A station; angles are its orientation as in 3GPP TR 38.901."""
+    """A station; bearing, downtilt and slant are its orientation as in 3GPP TR 38.901.
+
+    ``boresight_azimuth_deg`` and ``boresight_downtilt_deg`` are where its array looks, ``mounting`` is its local frame.
+    """
 
     id: str
     position: Point
     bearing_deg: float
     downtilt_deg: float
     slant_deg: float
+    mounting: str
+    boresight_azimuth_deg: float
+    boresight_downtilt_deg: float
     field_of_view_deg: float
 
 
@@ -143,6 +160,7 @@ def fix_answer(document: Mapping[str, Any]) -> FixAnswer:
                 used=bool(one["used"]),
                 outlier_probability=one["outlier_probability"],
                 reason=one.get("reason"),
+                source=one.get("source"),
             )
             for one in document["measurements"]
         ),
@@ -150,6 +168,10 @@ def fix_answer(document: Mapping[str, Any]) -> FixAnswer:
         compute_ms=float(document["compute_ms"]),
         track=None if track is None else _track(track),
         simplified=tuple(document.get("simplified", ())),
+        warnings=tuple(document.get("warnings", ())),
+        skipped=tuple(
+            SkippedMeasurement(source=one["source"], reason=one["reason"]) for one in document.get("skipped", ())
+        ),
     )
 
 
@@ -167,6 +189,9 @@ def station_answers(document: Mapping[str, Any]) -> tuple[StationAnswer, ...]:
             bearing_deg=one["orientation"]["bearing_deg"],
             downtilt_deg=one["orientation"]["downtilt_deg"],
             slant_deg=one["orientation"]["slant_deg"],
+            mounting=one["mounting"],
+            boresight_azimuth_deg=one["boresight"]["azimuth_deg"],
+            boresight_downtilt_deg=one["boresight"]["downtilt_deg"],
             field_of_view_deg=one["field_of_view_deg"],
         )
         for one in document["stations"]

@@ -14,6 +14,9 @@ from rayfix.client.calls import (
     Reply,
     batch_answers,
     batch_calls,
+    lines_answers,
+    lines_call,
+    message_call,
     position_call,
     reason_of,
     report_bytes,
@@ -119,6 +122,56 @@ class Client:
             answers += self._ask(call, partial(batch_answers, count=count))
         return answers
 
+    def locate_message(self, message: Mapping[str, Any], message_format: str) -> FixAnswer:
+        """Locate one message of another system.
+
+        Parameters
+        ----------
+        message : Mapping
+            Its JSON, as docs/formats.md has it.
+        message_format : {"nrppa", "silabs"}
+        """
+        return self._ask(message_call(message, message_format, self.settings.position_query), fix_answer)
+
+    def locate_messages(
+        self, messages: Iterable[Mapping[str, Any]], message_format: str
+    ) -> list[FixAnswer | ProblemError]:
+        """Locate any number of messages of another system, as :meth:`locate_batch` does reports.
+
+        Parameters
+        ----------
+        messages : iterable of Mapping
+        message_format : {"nrppa", "silabs"}
+        """
+        answers: list[FixAnswer | ProblemError] = []
+        for count, call in batch_calls(messages, self.settings.position_query, message_format):
+            answers += self._ask(call, partial(batch_answers, count=count))
+        return answers
+
+    def locate_lines(
+        self,
+        lines: str,
+        *,
+        stations: Mapping[str, str] | None = None,
+        height: tuple[float, float] | None = None,
+        confidence: float | None = None,
+    ) -> list[FixAnswer | ProblemError]:
+        """Locate from ``+UUDF`` lines of u-blox anchors: an answer for each transmission of each tag.
+
+        Parameters
+        ----------
+        lines : str
+        stations : Mapping, optional
+            Stations by anchor, for those whose id is no station's.
+        height : tuple of 2 floats, m, optional
+            Known height of the tags and its standard deviation.
+        confidence : float, optional
+            Probability with which accuracies are to hold.
+        """
+        query = self.settings.position_query
+        call = lines_call(lines, query, stations=stations, height=height, confidence=confidence)
+        return self._ask(call, lines_answers)
+
     def stations(self) -> tuple[StationAnswer, ...]:
         """List the stations that reports may name."""
         return self._ask(Call(method="GET", path="/v1/stations", query=self.settings.table_query), station_answers)
@@ -206,7 +259,7 @@ class Client:
             answer = self._http.request(
                 call.method,
                 self.settings.base + call.path,
-                params=dict(call.query),
+                params=dict(call.query) or None,  # an empty one would take that of the path away
                 headers=dict(call.headers),
                 content=call.body,
             )

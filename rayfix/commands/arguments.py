@@ -58,6 +58,11 @@ def mass_share(text: str) -> float:
     )
 
 
+def probability(text: str) -> float:
+    """Read a probability with which accuracies are to hold."""
+    return _number(text, float, lambda p: 0.01 <= p <= 0.99, "is no such probability; give 0.01 to 0.99, e.g. 0.95")
+
+
 def coordinate(text: str) -> float:
     """Read a coordinate."""
     return _number(text, float, math.isfinite, "is no coordinate; give a number of metres")
@@ -77,6 +82,16 @@ def web_origin(text: str) -> str:
             f"{text!r} is no origin; give scheme, host and port without a path, e.g. https://maps.example.com"
         )
     return text
+
+
+def web_prefix(text: str) -> str:
+    """Read the path below which a proxy offers the service."""
+    from rayfix_service.http.access.prefix import is_prefix
+
+    prefix = text.rstrip("/")
+    if not is_prefix(prefix):
+        raise argparse.ArgumentTypeError(f"{text!r} is no path of plain segments; give e.g. /rayfix")
+    return prefix
 
 
 def _number(text: str, kind: Callable[[str], _Number], fits: Callable[[_Number], bool], otherwise: str) -> _Number:
@@ -116,6 +131,16 @@ def add_output_arguments(command: argparse.ArgumentParser) -> None:
         nargs=2,
         metavar=("Z", "STDEV"),
         help="known height of the target in the scene and its standard deviation, m",
+    )
+
+
+def add_confidence_argument(command: argparse.ArgumentParser) -> None:
+    """Add the option of how probable it is that accuracies hold."""
+    command.add_argument(
+        "--confidence",
+        type=probability,
+        metavar="P",
+        help="probability with which the accuracies of the answer hold, 0.01 to 0.99 (default: the report's, or 0.68)",
     )
 
 

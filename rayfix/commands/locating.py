@@ -5,7 +5,13 @@ import json
 import os
 from pathlib import Path
 
-from rayfix.commands.arguments import AddCommand, add_hub_argument, add_output_arguments, hub_settings
+from rayfix.commands.arguments import (
+    AddCommand,
+    add_confidence_argument,
+    add_hub_argument,
+    add_output_arguments,
+    hub_settings,
+)
 from rayfix.extras import needs_extra
 
 _INPUTS = ("native", "nrppa", "silabs", "ublox")
@@ -19,6 +25,7 @@ def add_commands(add: AddCommand) -> None:
     locate.add_argument("report", type=Path, metavar="REPORT.json")
     locate.add_argument("--format", choices=_INPUTS, default="native", help="format of the report (default: native)")
     add_output_arguments(locate)
+    add_confidence_argument(locate)
     locate.add_argument("--json", action="store_true", help="the answer of the HTTP interface")
 
     mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: angles of Silicon Labs locators in, positions out")
@@ -36,6 +43,7 @@ def add_commands(add: AddCommand) -> None:
         help="topic of positions (default: rayfix/position/{target_id})",
     )
     add_output_arguments(mqtt)
+    add_confidence_argument(mqtt)
     mqtt.add_argument(
         "--window", type=float, default=0.5, help="seconds that a packet waits for more locators (default: 0.5)"
     )
@@ -58,6 +66,7 @@ def _locate(options: argparse.Namespace) -> int:
         output_format=options.output,
         stations=station_map(options.station),
         height=known_height(*(options.height or (None, None))),
+        confidence=options.confidence,
     )
     for document in answers:
         if options.json or options.output != "native":
@@ -89,6 +98,7 @@ def _mqtt(options: argparse.Namespace) -> int:
         stations=station_map(options.station),
         frame=options.frame,
         height=known_height(*(options.height or (None, None))),
+        confidence=options.confidence,
         track=options.track,
         hub=hub_settings(options),
     )

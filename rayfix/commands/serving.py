@@ -11,6 +11,7 @@ from rayfix.commands.arguments import (
     positive,
     report_rate,
     web_origin,
+    web_prefix,
 )
 from rayfix.extras import needs_extra
 
@@ -55,6 +56,18 @@ def add_commands(add: AddCommand) -> None:
         metavar="NAME",
         help="a name by which a service without keys may be called besides localhost, e.g. that of a proxy before it; "
         "may be given several times",
+    )
+    serve.add_argument(
+        "--root-path",
+        type=web_prefix,
+        default="",
+        metavar="PATH",
+        help="path below which a proxy offers the service, e.g. /rayfix; the proxy may take it off or not",
+    )
+    serve.add_argument(
+        "--trust-forwarded-prefix",
+        action="store_true",
+        help="take that path from the header X-Forwarded-Prefix; only where nobody but the proxy reaches the service",
     )
     serve.add_argument(
         "--check-seconds",
@@ -119,6 +132,8 @@ def _serve(options: argparse.Namespace) -> int:
             reports_per_second=options.rate_limit,
             cors_origins=tuple(options.cors_origin),
             hosts=tuple(options.allowed_host),
+            root_path=options.root_path,
+            trust_forwarded_prefix=options.trust_forwarded_prefix,
             connection_limits=ConnectionLimits(
                 connections=options.connections,
                 head_bytes=options.head_kib << 10,

@@ -1,11 +1,14 @@
 """Positions of reports, by a table."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from rayfix_service.batch import locate_batch
+from rayfix_service.fusion.diagnosis.suspects import suspects
+from rayfix_service.fusion.diagnosis.turned import find_turns, turn_warning, turned_report
 from rayfix_service.fusion.fusion import Fusion
 from rayfix_service.fusion.measurements.checks import check_report
 from rayfix_service.fusion.measurements.report import Angle, Range, Report
@@ -67,7 +70,32 @@ class Locator:
             When it was stopped.
         """
         report = _read(report)
-        return make_fix(report, self._fusion.product(report, stop), self.table, self.settings, stop)
+        return self.explain(report, self._fused(report, stop).fix, stop=stop)
+
+    def explain(self, report: Report, fix: Fix, *, stop: Stop = NEVER) -> Fix:
+        """Search the stations of an inconsistent report for a constant turn of their angles, and warn of it.
+
+        :meth:`locate` does it at once. The search takes at most ``FusionSettings.most_turn_fixes`` further fixes, and
+        none for a fix of another status.
+
+        Parameters
+        ----------
+        report : Report
+        fix : Fix
+            Of that report.
+        stop : Stop
+            As of :meth:`locate`.
+        """
+        if fix.status != "inconsistent" or self.settings.most_turn_fixes == 0:
+            return fix
+
+        def relocate(changed: Report, turns: Mapping[str, float]) -> Fix:
+            changed, site = turned_report(changed, self.table.site, turns)
+            product = self._fusion.product(changed, stop, site=site)
+            return make_fix(changed, product, self.table, self.settings, stop)
+
+        turns = find_turns(report, fix, self.table.site, relocate, most_fixes=self.settings.most_turn_fixes)
+        return replace(fix, warnings=(*fix.warnings, turn_warning(turns))) if turns else fix
 
     def locate_batch(self, reports: Sequence[Report | Mapping[str, Any]], *, jobs: int = -1) -> list[Fix | ReportError]:
         """Fuse the measurements of many reports, on several processor cores.
@@ -97,16 +125,15 @@ class Locator:
     def fuse(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Fused:
         """Locate a report and keep its likelihood, for :class:`~rayfix_service.tracking.tracker.Tracker`.
 
+        It does not :meth:`explain` the fix.
+
         Parameters
         ----------
         report : Report or mapping
         stop : Stop
             As of :meth:`locate`, and so are the errors.
         """
-        report = _read(report)
-        product = self._fusion.product(report, stop)
-        fix = make_fix(report, product, self.table, self.settings, stop)
-        return Fused(fix=fix, hypotheses=product.hypotheses, prior=product.prior)
+        return self._fused(_read(report), stop)
 
     def posterior(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Posterior:
         """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.
@@ -143,6 +170,13 @@ class Locator:
         regions = CredibleRegions(position=np.zeros(3), covariance=np.eye(3), points=points, share=1.0)
         regions.upright_ellipsoid(0.5)
         _ = regions.accuracies(0.5).ellipsoid.semi_axes
+
+    def _fused(self, report: Report, stop: Stop) -> Fused:
+        product = self._fusion.product(report, stop)
+        fix = make_fix(report, product, self.table, self.settings, stop)
+        if fix.status == "inconsistent":
+            fix = replace(fix, warnings=(suspects(report, fix),))
+        return Fused(fix=fix, hypotheses=product.hypotheses, prior=product.prior)
 
 
 def _read(report: Report | Mapping[str, Any]) -> Report:

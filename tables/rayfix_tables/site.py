@@ -3,10 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+Mounting = Literal["3gpp", "silabs", "ublox"]
+"""Local frame of an array, by who defines it; :mod:`rayfix_tables.mounting` has their axes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +47,10 @@ class Station:
     orientation : tuple of 3 floats, rad
         Bearing, downtilt and slant, as in 3GPP TR 38.901; they turn the scene frame into the station's local one.
     field_of_view : float, rad
-        Full opening angle of the cone around the station's local +x axis in which it measures.
+        Full opening angle of the cone around the station's boresight in which it measures.
     bias : StationBias
+    mounting : {"3gpp", "silabs", "ublox"}
+        Which axes of the local frame are the array's boresight and upper edge.
     """
 
     id: str
@@ -53,6 +58,7 @@ class Station:
     orientation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     field_of_view: float = 6.283185307179586
     bias: StationBias = NO_BIAS
+    mounting: Mounting = "3gpp"
 
     def moved(self, by: NDArray[np.float64]) -> "Station":
         """Return the same station elsewhere, moved by a vector of shape (3,), m."""

@@ -20,6 +20,7 @@ from rayfix_tables.disk.schema import (
     content_of,
     level_path,
     read_bias,
+    read_mounting,
 )
 from rayfix_tables.disk.values import check_finite, check_offsets, check_range, check_rings
 from rayfix_tables.freespace import FreeSpace
@@ -111,6 +112,7 @@ class Table:
                 orientation=_radians(_triple(attributes["orientation_deg"])),
                 field_of_view=float(np.deg2rad(_finite(attributes["field_of_view_deg"]))),
                 bias=read_bias(attributes),
+                mounting=read_mounting(attributes),
             ).moved(scene.origin)
             levels = tuple(_read_level(path, layout, mapped) for path in _level_paths(layout, station_id))
             stations.append(station)

@@ -32,7 +32,7 @@ from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES
 from rayfix_tables.part import StationPart, Update
 from rayfix_tables.scene import Scene
-from rayfix_tables.site import SiteInfo
+from rayfix_tables.site import SiteInfo, Station
 
 _LIBVER = ("v108", "v108")
 """Of HDF5's own structures: those since 1.8 have checksums, so that a damaged one is found and not followed."""
@@ -215,6 +215,8 @@ def _write_part(file: h5py.File, part: StationPart, origin: NDArray[np.float64])
     group.attrs["position_m"] = np.asarray(station.position) - origin
     group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
     group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
+    if station.mounting != Station.mounting:  # or tables of older versions would change
+        write_text(group, "mounting", station.mounting)
     for name, value in bias_attributes(station.bias).items():
         group.attrs[name] = value
     write_text(group, "part_id", part.part_id)

@@ -11,7 +11,9 @@ import pytest
 
 import rayfix
 from rayfix.client import FixAnswer, FixEvent, ProblemError, RefusedReportError
+from rayfix.errors import ClientError
 from rayfix.example.files import example_report
+from rayfix_service.http.openapi.examples import NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.wire import parse_report
 from rayfix_tables.errors import ReportError
 
@@ -151,3 +153,26 @@ def test_the_client_for_asyncio_does_the_same(service_url: str, report: dict[str
             assert first.result().fix.position == expected.position
 
     asyncio.run(scenario())
+
+
+def test_messages_of_other_systems_are_located(service_url: str):
+    message = SILABS_EXAMPLES["three_locators"]["value"]
+    lines = UBLOX_EXAMPLES["three_anchors"]["value"].replace('"bs1"', '"door"')
+    with rayfix.Client(service_url) as client:
+        fix = client.locate_message(message, "silabs")
+        batch = client.locate_messages([message, {}], "silabs")
+        nrppa = client.locate_message(NRPPA_EXAMPLES["ul_aoa_and_ul_rtoa"]["value"], "nrppa")
+        (line,) = client.locate_lines(lines, stations={"door": "bs1"}, height=(1.5, 0.1), confidence=0.9)
+        (wrong,) = client.locate_lines(lines)
+        with pytest.raises(ClientError, match="locate_lines"):
+            client.locate_message(message, "ublox")
+    assert isinstance(batch[0], FixAnswer)
+    assert batch[0].position == fix.position
+    assert [outcome.source for outcome in fix.measurements] == ["angles[0]", "angles[1]", "angles[2]"]
+    assert isinstance(batch[1], RefusedReportError)
+    assert (nrppa.target_id, nrppa.skipped) == ("ue-7", ())
+    assert isinstance(line, FixAnswer)
+    assert line.position is not None
+    assert line.position.z == pytest.approx(1.5, abs=0.2)
+    assert line.confidence == pytest.approx(0.9, abs=0.02)
+    assert isinstance(wrong, RefusedReportError)

@@ -26,7 +26,7 @@ def refused(document: dict[str, Any]) -> str:
 
 def test_the_shortest_site_has_the_documented_defaults() -> None:
     site = parse_site({"site": {"name": "a", "scene": "a.glb"}, "stations": [{"id": "s", "position_m": [1, 2, 3]}]})
-    assert site.model_dump(mode="json") == {
+    assert site.info().document == {
         "site": {"name": "a", "scene": "a.glb", "scene_unit": "m", "scene_up": "z", "north_deg": 90.0},
         "propagation": {
             "carrier_ghz": 3.5,
@@ -42,7 +42,7 @@ def test_the_shortest_site_has_the_documented_defaults() -> None:
             {
                 "id": "s",
                 "position_m": [1, 2, 3],
-                "orientation_deg": [0, 0, 0],
+                "mounting": "3gpp",
                 "field_of_view_deg": 360.0,
                 "bias": {
                     "range_m": 0.0,
@@ -71,8 +71,28 @@ def test_the_table_gets_radians(site_document: Document) -> None:
     assert station.field_of_view == pytest.approx(2 * np.pi / 3, rel=1e-15)
     assert (station.bias.range, station.bias.range_stdev, station.bias.zenith) == (0.2, 0.1, 0.0)
     assert (station.bias.azimuth, station.bias.angle_stdev) == pytest.approx((np.pi / 10, np.pi / 20), rel=1e-15)
-    assert info.document == site.model_dump(mode="json")
     assert parse_site(info.document) == site
+
+
+@pytest.mark.parametrize("key", ["boresight_azimuth_deg", "boresight_downtilt_deg", "roll_deg"])
+def test_an_array_is_turned_in_one_way(site_document: Document, key: str) -> None:
+    document = site_document()
+    document["stations"][0] |= {"orientation_deg": [90, 0, 120], key: 0.0}
+    assert refused(document).startswith(
+        f"stations[0]: orientation_deg and {key} both say how the array is turned; give"
+    )
+
+
+def test_the_boresight_is_another_way_to_say_the_orientation(site_document: Document) -> None:
+    document = site_document()
+    document["stations"][0] |= {"mounting": "silabs", "boresight_downtilt_deg": 30}
+    (mounted,) = parse_site(document).info().stations
+    assert np.rad2deg(mounted.orientation) == pytest.approx((90, 0, 120), abs=1e-12)
+    del document["stations"][0]["boresight_downtilt_deg"]
+    document["stations"][0]["orientation_deg"] = [90, 0, 120]
+    (turned,) = parse_site(document).info().stations
+    assert (turned.mounting, turned.orientation) == ("silabs", pytest.approx(mounted.orientation, abs=1e-12))
+    assert parse_site(parse_site(document).info().document) == parse_site(document)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +108,10 @@ def test_an_unknown_key(site_document: Document, section: str, label: str, sibli
 def test_an_unknown_key_of_a_station(site_document: Document) -> None:
     document = site_document()
     document["stations"].append({"id": "bs2", "position_m": [1, 1, 1], "positon_m": [1, 1, 1]})
-    expected = "id, position_m, orientation_deg, field_of_view_deg, bias"
+    expected = (
+        "id, position_m, mounting, boresight_azimuth_deg, boresight_downtilt_deg, roll_deg, orientation_deg, "
+        "field_of_view_deg, bias"
+    )
     assert refused(document) == f"unknown key stations[1].positon_m; [stations] knows {expected}"
 
 
@@ -153,6 +176,10 @@ def test_a_missing_section(site_document: Document, section: str) -> None:
         ("stations[0].position_m", [1, float("inf"), 3]),
         ("stations[0].position_m", [1, "two", 3]),
         ("stations[0].orientation_deg", [0, 0, float("nan")]),
+        ("stations[0].mounting", "ceiling"),
+        ("stations[0].boresight_azimuth_deg", 361),
+        ("stations[0].boresight_downtilt_deg", 91),
+        ("stations[0].roll_deg", float("inf")),
         ("stations[0].field_of_view_deg", 0),
         ("stations[0].field_of_view_deg", 361),
         ("site", 5),

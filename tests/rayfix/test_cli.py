@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from rayfix.cli import main
+from rayfix.console import print_fix
 from rayfix.example.drop import EXAMPLE_POSITION
 from rayfix.example.files import write_example
 from rayfix_tables.table import Table
@@ -301,3 +302,23 @@ def test_an_interrupted_build_leaves_the_former_table(tmp_path: Path, hall_table
     assert table.read_bytes() == before
     # What is finished waits in its folder for the next run; nothing else is there.
     assert {p.name for p in tmp_path.iterdir()} == {".t.h5.shards", "site", "t.h5"}
+
+
+def test_an_inconsistent_fix_is_shown_without_probabilities(capsys: pytest.CaptureFixture[str]) -> None:
+    place = {"x": 1.0, "y": 2.0, "z": 3.0}
+    print_fix(
+        {
+            "status": "inconsistent",
+            "position": place,
+            "candidates": [{"probability": 0.996, "position": place}],
+            "horizontal_accuracy_m": 0.2,
+            "vertical_accuracy_m": 0.2,
+            "confidence": 0.68,
+            "measurements": [{"index": 0, "used": True, "outlier_probability": 0.97}],
+            "warnings": ["probably outliers are the angle of station 'bs1' (measurements[0])"],
+        }
+    )
+    out = capsys.readouterr().out
+    assert out.splitlines()[0] == "inconsistent: (1.00, 2.00, 3.00) m is only the best guess"
+    assert "the angle of station 'bs1'" in out
+    assert "%" not in out

@@ -298,6 +298,7 @@ def variations(content: Any) -> dict[str, Any]:
         "station id": with_station(id="other"),
         "position": with_station(position=(x, y, z * near)),
         "orientation": with_station(orientation=(0.1, 0.2, 0.3)),
+        "mounting": with_station(mounting="silabs"),
         "field_of_view": with_station(field_of_view=station.field_of_view * near),
         "bias": with_station(bias=replace(station.bias, range=station.bias.range * near)),
         "lost_ray_share": with_part(lost_ray_share=first.lost_ray_share * near),
@@ -330,7 +331,7 @@ def test_the_id_changes_with_every_part_of_the_content(make_content: Callable[..
     for name, varied in variations(content).items():
         ids[name] = varied.write(tmp_path / "t.h5")
     assert len(set(ids.values())) == len(ids)
-    assert len(ids) == 27 + len(FIELD_SHAPES)
+    assert len(ids) == 28 + len(FIELD_SHAPES)
 
 
 def with_update(content: Any, seed: int = 0) -> Any:

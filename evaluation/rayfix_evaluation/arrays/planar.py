@@ -1,8 +1,8 @@
 """A uniform planar array, and what its antennas receive of the paths to a station.
 
-The array lies in the y-z plane of the station's local frame and looks along its x axis. A plane wave from the local
-direction d meets antenna (n, m), which is n columns along y and m rows along z from the middle, with the phase
-2 pi spacing (n d_y + m d_z), so that the direction cosines (d_y, d_z) are what the array measures.
+The array lies in the y-z plane of the mounted board (docs/mounting.md) and looks along its x axis. A plane wave from
+the board's direction d meets antenna (n, m), which is n columns along y and m rows along z from the middle, with the
+phase 2 pi spacing (n d_y + m d_z), so that the direction cosines (d_y, d_z) are what the array measures.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from rayfix_evaluation.truth.forward import Paths
 from rayfix_service.measuring.ranging import SPEED_OF_LIGHT
-from rayfix_tables.angles import direction, local_to_scene
+from rayfix_tables.angles import direction
+from rayfix_tables.mounting import board_to_scene
 from rayfix_tables.site import Station
 
 Array = NDArray[np.float64]
@@ -31,7 +32,7 @@ class PlanarArray:
     Attributes
     ----------
     columns, rows : int
-        Antennas along the local y and z axis.
+        Antennas along the board's y and z axis.
     spacing : float
         Between neighbours, in wavelengths.
     """
@@ -61,7 +62,7 @@ class PlanarArray:
         Parameters
         ----------
         cosines : ndarray of shape (n, 2)
-            Along the local y and z axis.
+            Along the board's y and z axis.
 
         Returns
         -------
@@ -82,14 +83,14 @@ def to_cosines(station: Station, azimuth: Array, zenith: Array) -> tuple[Array, 
     cosines : ndarray of shape (n, 2)
     before : ndarray of bool of shape (n,)
     """
-    local = direction(azimuth, zenith) @ local_to_scene(station.orientation)
+    local = direction(azimuth, zenith) @ board_to_scene(station)
     return local[:, 1:], local[:, 0] > 0.0
 
 
 def to_scene_direction(station: Station, cosines: Array) -> Array:
     """Turn direction cosines of waves from before the array into unit vectors of the scene, shape (n, 3)."""
     ahead = np.sqrt(np.maximum(1.0 - np.square(cosines).sum(axis=1), 0.0))
-    return np.asarray(np.column_stack([ahead, cosines]) @ local_to_scene(station.orientation).T)
+    return np.asarray(np.column_stack([ahead, cosines]) @ board_to_scene(station).T)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,8 @@ from rayfix_evaluation.drops.stress import (
     with_turned_stations,
 )
 from rayfix_evaluation.truth.forward import Paths
-from rayfix_tables.angles import direction, local_to_scene
+from rayfix_tables.angles import direction
+from rayfix_tables.mounting import board_to_scene
 from rayfix_tables.site import Station
 
 __all__ = ["Case", "Simulated", "World", "document_key", "in_view", "simulate_case"]
@@ -177,7 +178,7 @@ def simulate_case(case: Case, drop: Drop, number: int, stations: Sequence[Statio
 
 def in_view(station: Station, paths: Paths) -> Paths:
     """Those paths that come from within a station's field of view."""
-    axis = local_to_scene(station.orientation)[:, 0]
+    axis = board_to_scene(station)[:, 0]
     cosine = np.clip(direction(paths.azimuth, paths.zenith) @ axis, -1.0, 1.0)
     return _subset(paths, np.flatnonzero(np.arccos(cosine) <= 0.5 * station.field_of_view))
 

@@ -11,8 +11,9 @@ from rayfix_offline.job.shards import content_key
 from rayfix_offline.rays.trace import level_grid
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin.twin import Twin
-from rayfix_tables.angles import direction, local_to_scene
+from rayfix_tables.angles import direction
 from rayfix_tables.disk.schema import ARRAYS_VERSION
+from rayfix_tables.mounting import board_to_scene
 from rayfix_tables.site import Station
 
 BUILD_VERSION = 5
@@ -63,8 +64,8 @@ class StationPlan:
     Attributes
     ----------
     part_id : str
-        SHA-256 of all that decides the content of the part: scene, free space, propagation, table settings, the station
-        without its bias, and the method with its version. Other stations have no influence.
+        SHA-256 of all that decides the content of the part: scene, free space, propagation, table settings, position
+        and field of view of the station, and the method with its version. Other stations have no influence.
     """
 
     section: StationSection
@@ -126,7 +127,7 @@ def updated_part_id(exact_part_id: str, former_part_id: str, tolerance: float) -
 
 def _blocks(station: Station, site: SiteFile, method: Method) -> tuple[Block, ...]:
     """Cells of each level whose centre lies within one window of the station's field of view, in blocks."""
-    axis = local_to_scene(station.orientation)[:, 0]
+    axis = board_to_scene(station)[:, 0]
     blocks: list[Block] = []
     for level, window in enumerate(np.deg2rad(site.table.windows_deg)):
         centres = level_grid(float(window), cells_per_window=method.rays.cells_per_window).centres

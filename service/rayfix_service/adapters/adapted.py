@@ -5,7 +5,14 @@ from dataclasses import dataclass, replace
 
 from pydantic import ValidationError
 
-from rayfix_service.fusion.measurements.report import Angle, Height, Measurement, Report, TimeOfArrival
+from rayfix_service.fusion.measurements.report import (
+    CONFIDENCE,
+    Angle,
+    Height,
+    Measurement,
+    Report,
+    TimeOfArrival,
+)
 from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportError
 from rayfix_service.wire.documents import HeightDocument
 from rayfix_service.wire.problems import MAX_PROBLEMS
@@ -54,6 +61,7 @@ def adapted_report(
     target_id: str | None,
     timestamp: str | None,
     height: Height | None = None,
+    confidence: float = CONFIDENCE,
 ) -> Adapted:
     """Combine measurements and what was left out.
 
@@ -84,7 +92,13 @@ def adapted_report(
         first.setdefault(measurement, path)
         kept.append((path, measurement))
     return Adapted(
-        report=Report(measurements=tuple(m for _, m in kept), height=height, target_id=target_id, timestamp=timestamp),
+        report=Report(
+            measurements=tuple(m for _, m in kept),
+            height=height,
+            confidence=confidence,
+            target_id=target_id,
+            timestamp=timestamp,
+        ),
         sources=tuple(path for path, _ in kept),
         skipped=(*skipped, *repeated),
     )
@@ -100,6 +114,21 @@ def with_height(adapted: Adapted, height: Height | None) -> Adapted:
     if height is None or adapted.report.height is not None:
         return adapted
     return replace(adapted, report=replace(adapted.report, height=height))
+
+
+def with_confidence(adapted: Adapted, confidence: float | None) -> Adapted:
+    """Ask for another probability with which accuracies are to hold; None leaves it to the report.
+
+    Raises
+    ------
+    ReportError
+        When it is out of range.
+    """
+    if confidence is None:
+        return adapted
+    if not 0.01 <= confidence <= 0.99:
+        raise ReportError(f"confidence is {confidence:g}; give a probability from 0.01 to 0.99", path=("confidence",))
+    return replace(adapted, report=replace(adapted.report, confidence=confidence))
 
 
 def error_in_message(error: ReportError, adapted: Adapted) -> InvalidReportError:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from rayfix_service.adapters.adapted import Adapted, with_height
+from rayfix_service.adapters.adapted import Adapted, with_confidence, with_height
 from rayfix_service.adapters.nrppa import parse_nrppa
 from rayfix_service.adapters.omlox import fix_to_omlox
 from rayfix_service.adapters.silabs import parse_silabs
@@ -26,6 +26,7 @@ def parse(
     *,
     stations: Mapping[str, str] | None = None,
     height: Height | None = None,
+    confidence: float | None = None,
 ) -> tuple[Adapted, ...]:
     """Turn a message into reports: one, or for u-blox lines one for each transmission.
 
@@ -38,6 +39,8 @@ def parse(
         Stations by the names that the message has for them; the native format has the stations' own.
     height : Height, optional
         Known height of the target, for messages without one.
+    confidence : float, optional
+        Probability with which accuracies are to hold, instead of that of the message.
 
     Raises
     ------
@@ -45,8 +48,11 @@ def parse(
         For bytes that are not JSON in a format that is.
     InvalidReportError
         For a message that is not valid.
+    ReportError
+        For a confidence that is out of range.
     """
-    return tuple(with_height(adapted, height) for adapted in _parse(body, input_format, stations))
+    found = _parse(body, input_format, stations)
+    return tuple(with_confidence(with_height(adapted, height), confidence) for adapted in found)
 
 
 def _parse(body: bytes, input_format: InputFormat, stations: Mapping[str, str] | None) -> tuple[Adapted, ...]:

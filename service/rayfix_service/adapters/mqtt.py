@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 import aiomqtt
 
-from rayfix_service.adapters.adapted import Adapted
+from rayfix_service.adapters.adapted import Adapted, with_confidence
 from rayfix_service.adapters.formats import OutputFormat, write
 from rayfix_service.adapters.omlox_hub import HubSettings, OmloxHub, open_hub
 from rayfix_service.adapters.silabs_stream import SilabsStream
@@ -66,6 +66,8 @@ class MqttSettings:
         Frame of the angles.
     height : Height or None
         What is known of the height of all tags.
+    confidence : float or None
+        Probability with which the accuracies of positions are to hold; None for 0.68.
     track : bool
         Whether tags are followed from packet to packet.
     hub : HubSettings or None
@@ -79,6 +81,7 @@ class MqttSettings:
     stations: Mapping[str, str] = field(default_factory=dict)
     frame: Frame = "lcs"
     height: Height | None = None
+    confidence: float | None = None
     track: bool = False
     hub: HubSettings | None = None
 
@@ -285,7 +288,7 @@ class _Session:
     def _answer(self, adapted: Adapted) -> dict[str, Any]:
         """Locate a packet, update its tag's track, and send the position to the hub."""
         begin = perf_counter()
-        fused = self.locator.fuse(adapted.report)
+        fused = self.locator.fuse(with_confidence(adapted, self.settings.confidence).report)
         seconds = perf_counter() - begin
         track = self.tracker.follow(fused) if self.tracker is not None else None
         site = self.locator.table.site

@@ -106,6 +106,7 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
         target_id=document.target_id,
         timestamp=document.timestamp,
         height=None if document.height is None else document.height.height(),
+        confidence=document.confidence,
     )
 
 

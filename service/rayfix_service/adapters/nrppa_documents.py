@@ -12,8 +12,9 @@ from pydantic import ConfigDict, Field, model_validator
 
 from rayfix_service.adapters.documents import KnownHeight, Stations, TargetId, Timestamp, integer, not_used, one_of
 from rayfix_service.adapters.report_mapping import largest_time_value
-from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportError, WireModel
-from rayfix_service.wire.fields import misfit
+from rayfix_service.fusion.measurements.report import CONFIDENCE
+from rayfix_service.wire import MAX_MEASUREMENTS, MAX_REPORTS, FieldProblem, InvalidReportError, WireModel
+from rayfix_service.wire.fields import Confidence, misfit
 
 _Tenths = integer(3599, "an angle in 0.1 deg")
 _Azimuth = integer(3599, "an azimuth in 0.1 deg")
@@ -291,6 +292,7 @@ class NrppaDocument(WireModel):
     timestamp: Timestamp = None
     stations: Stations = None
     height: KnownHeight = None
+    confidence: Confidence = CONFIDENCE
     azimuth_zero_deg: Literal[0, -180] = Field(
         default=0, description="0 or -180, the azimuth in degrees at which azimuthAoA = 0 begins"
     )
@@ -308,6 +310,16 @@ class NrppaDocument(WireModel):
             text += "; give exactly one of TRP-MeasurementResponseList and TRP-MeasurementReportList"
             raise misfit(None, text)
         return self
+
+
+class NrppaBatchDocument(WireModel):
+    """Many messages, answered in their order; each is read on its own."""
+
+    model_config = ConfigDict(title="NrppaBatch")
+
+    reports: list[NrppaDocument] = Field(
+        max_length=MAX_REPORTS, description=f"an array of at most {MAX_REPORTS} messages"
+    )
 
 
 OUTCOMES = ("initiatingMessage", "successfulOutcome")

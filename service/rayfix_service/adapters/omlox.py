@@ -43,6 +43,8 @@ def fix_to_omlox(fix: Fix, site: SiteInfo, track: TrackedPosition | None = None)
             "rayfix.table_id": fix.table_id,
         },
     }
+    if fix.warnings:
+        location["properties"]["rayfix.warnings"] = list(fix.warnings)
     timestamp = fix.timestamp if track is None else track.timestamp
     if timestamp is not None:
         location["timestamp_generated"] = utc_milliseconds(timestamp)

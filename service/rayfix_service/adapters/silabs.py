@@ -12,9 +12,9 @@ from pydantic import ConfigDict, Field, model_validator
 
 from rayfix_service.adapters.adapted import Adapted, adapted_report, station_of
 from rayfix_service.adapters.documents import KnownHeight, Stations, TargetId, Timestamp, check
-from rayfix_service.fusion.measurements.report import Angle, Frame, Measurement, Range
-from rayfix_service.wire import MAX_MEASUREMENTS, WireModel
-from rayfix_service.wire.fields import misfit
+from rayfix_service.fusion.measurements.report import CONFIDENCE, Angle, Frame, Measurement, Range
+from rayfix_service.wire import MAX_MEASUREMENTS, MAX_REPORTS, WireModel
+from rayfix_service.wire.fields import Confidence, misfit
 from rayfix_tables.angles import wrap_one
 from rayfix_tables.problems import Path
 
@@ -64,12 +64,23 @@ class SilabsDocument(WireModel):
     timestamp: Timestamp = None
     stations: Stations = None
     height: KnownHeight = None
+    confidence: Confidence = CONFIDENCE
     frame: Frame = Field(default="lcs", description='one of "lcs", "scene" and "north", the frame of the angles')
     least_stdev_deg: float = Field(
         default=LEAST_STDEV_DEG, ge=1e-6, le=360, description="the least standard deviation to believe, 1e-06 to 360"
     )
     angles: list[SilabsLocatorAngle] = Field(
         min_length=1, max_length=MAX_MEASUREMENTS, description=f"an array of 1 to {MAX_MEASUREMENTS} angles"
+    )
+
+
+class SilabsBatchDocument(WireModel):
+    """The angles of many packets, answered in their order; each is read on its own."""
+
+    model_config = ConfigDict(title="SilabsBatch")
+
+    reports: list[SilabsDocument] = Field(
+        max_length=MAX_REPORTS, description=f"an array of at most {MAX_REPORTS} messages"
     )
 
 
@@ -103,6 +114,7 @@ def parse_silabs(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, s
         target_id=document.target_id,
         timestamp=document.timestamp,
         height=None if document.height is None else document.height.height(),
+        confidence=document.confidence,
     )
 
 

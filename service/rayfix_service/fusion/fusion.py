@@ -10,6 +10,7 @@ from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_pri
 from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
+from rayfix_tables.site import SiteInfo
 from rayfix_tables.table import Table
 
 _NO_RAYS = "no ray of station '{}' comes from that direction"
@@ -57,12 +58,14 @@ class Fusion:
         """
         return self._cost.seconds(report)
 
-    def product(self, report: Report, stop: Stop = NEVER) -> Product:
+    def product(self, report: Report, stop: Stop = NEVER, *, site: SiteInfo | None = None) -> Product:
         """Multiply the likelihoods of the measurements of a report.
 
         Parameters
         ----------
         report : Report
+        site : SiteInfo, optional
+            Whose stations the report is of; the table's by default.
         stop : Stop
             Ends it early, from another thread.
 
@@ -73,7 +76,7 @@ class Fusion:
         FixStoppedError
             When it was stopped.
         """
-        sorted_report = sort_report(report, self.table.site)
+        sorted_report = sort_report(report, site or self.table.site)
         prior = self._uniform_prior
         if report.height is not None:
             scene = self.table.scene

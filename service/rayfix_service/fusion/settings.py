@@ -44,6 +44,8 @@ class FusionSettings:
         that.
     insufficient_above : float, m
         A best candidate whose largest standard deviation is above this makes the fix ``insufficient``.
+    most_turn_fixes : int
+        Further fixes that an inconsistent report may take to find stations whose angles are turned; 0 for no search.
 
     Raises
     ------
@@ -64,6 +66,7 @@ class FusionSettings:
     ambiguous_below: Probability = 0.7
     most_rivals: Annotated[int, Limits(least=1)] = 3
     insufficient_above: Annotated[float, Limits(above=0.0)] = 3.0
+    most_turn_fixes: Annotated[int, Limits(least=0, most=1000)] = 16
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""

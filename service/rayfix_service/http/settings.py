@@ -77,6 +77,10 @@ class ServiceSettings:
         Origins such as ``https://maps.example.com`` whose pages may call the service from a browser.
     hosts : tuple of str
         Names by which a service without keys may be called, besides loopback addresses; empty where any will do.
+    root_path : str
+        Path below which a proxy offers the service, such as ``/rayfix``; empty for none.
+    trust_forwarded_prefix : bool
+        Whether the header ``X-Forwarded-Prefix`` names that path. Only for services that a proxy alone can reach.
     quick_fix_seconds : float
         A fix that takes no longer than this, by an estimate from its report, is made on the event loop; the others, the
         slow ones, are made in threads.
@@ -109,6 +113,8 @@ class ServiceSettings:
     burst_seconds: float = 2.0
     cors_origins: tuple[str, ...] = ()
     hosts: tuple[str, ...] = ()
+    root_path: str = ""
+    trust_forwarded_prefix: bool = False
     quick_fix_seconds: float = 0.005
     fix_seconds: float = 10.0
     slow_fix_threads: int = 2

@@ -9,17 +9,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi.middleware.cors import CORSMiddleware
 from pydantic.json_schema import models_json_schema
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from rayfix_service.adapters.nrppa_documents import NrppaDocument
+from rayfix_service.adapters.nrppa_documents import NrppaBatchDocument, NrppaDocument
 from rayfix_service.adapters.omlox_hub import open_hub
-from rayfix_service.adapters.silabs import SilabsDocument
+from rayfix_service.adapters.silabs import SilabsBatchDocument, SilabsDocument
 from rayfix_service.http.access.edge import Edge
 from rayfix_service.http.access.guard import Access, describe_access
 from rayfix_service.http.access.keys import ApiKeys
+from rayfix_service.http.access.prefix import Prefix
 from rayfix_service.http.access.rates import Accounts, RateLimit
 from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.feed_relay import FeedRelay
@@ -29,8 +30,9 @@ from rayfix_service.http.answering.slow_work import SlowWork
 from rayfix_service.http.answering.table_cache import TableCache
 from rayfix_service.http.answering.table_checks import TableChecks
 from rayfix_service.http.errors import ServiceError
-from rayfix_service.http.problems import Problem, install_problems
+from rayfix_service.http.problems import INVALID_PARAMETER, Problem, install_problems, problem_responses
 from rayfix_service.http.routes import formats, health, positions, stream, table
+from rayfix_service.http.routes.query_parameters import refuse_unknown_parameters
 from rayfix_service.http.routes.stream import FixEventDocument
 from rayfix_service.http.services import Services, set_services
 from rayfix_service.http.settings import ServiceSettings
@@ -84,7 +86,9 @@ class RayfixApp(FastAPI):
                     (ReportDocument, "validation"),
                     (BatchDocument, "validation"),
                     (NrppaDocument, "validation"),
+                    (NrppaBatchDocument, "validation"),
                     (SilabsDocument, "validation"),
+                    (SilabsBatchDocument, "validation"),
                     (FixEventDocument, "validation"),
                     (SimulationRequest, "validation"),
                     (Problem, "serialization"),
@@ -93,8 +97,17 @@ class RayfixApp(FastAPI):
             )
             document["components"]["schemas"].update(schemas["$defs"])
             describe_access(document)
+            _describe_parameters(document)
             self.openapi_schema = document
         return self.openapi_schema
+
+
+def _describe_parameters(document: dict[str, Any]) -> None:
+    """Add to an OpenAPI document that every path refuses query parameters that it does not know."""
+    refusals = {str(status): response for status, response in problem_responses(INVALID_PARAMETER).items()}
+    for operations in document["paths"].values():
+        for operation in operations.values():
+            operation["responses"] = refusals | operation["responses"]
 
 
 def create_app(
@@ -193,6 +206,8 @@ def create_app(
         description=_DESCRIPTION,
         version="1",
         lifespan=lifespan,
+        dependencies=[Depends(refuse_unknown_parameters)],
+        openapi_url=None,  # routes_assets has a route with the examples of the table and the proxy's path
         docs_url=None,  # FastAPI's own page gets its script from elsewhere; routes_assets has one that does not
         redoc_url=None,
         redirect_slashes=False,  # a redirected POST loses its body in many clients; a 404 is clear
@@ -214,6 +229,7 @@ def create_app(
     app.surround(
         Edge, hosts=settings.hosts, origins=tuple(settings.cors_origins), asks_for_keys=settings.api_keys is not None
     )
+    app.surround(Prefix, root_path=settings.root_path, trusts_header=settings.trust_forwarded_prefix)
     app.surround(RequestContext, metrics=metrics)
     app.include_router(positions.router)
     app.include_router(formats.router)

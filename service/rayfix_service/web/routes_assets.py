@@ -1,12 +1,17 @@
 """The viewer's page, the page of the HTTP interface, and their files."""
 
 from functools import cache
+from typing import Any
 
 from fastapi import APIRouter, Request, Response
+from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
+from rayfix_service.http.access.prefix import prefix_of
+from rayfix_service.http.routes.dependencies import ServicesDep
 from rayfix_service.web.assets import INDEX, INTERFACE, SECURITY_HEADERS, Asset, load_assets
 from rayfix_service.web.plain_interface import plain_interface
+from rayfix_service.web.site_examples import with_site_examples
 
 router = APIRouter(include_in_schema=False)
 
@@ -40,6 +45,21 @@ async def get_interface(request: Request) -> Response:
     """Give the page that shows the OpenAPI document."""
     asset = _assets().get(INTERFACE)
     return _plain(plain_interface(request.app.openapi())) if asset is None else _answer(request, asset)
+
+
+@router.api_route("/openapi.json", methods=["GET", "HEAD"])
+async def get_openapi(request: Request, services: ServicesDep) -> Response:
+    """Give the OpenAPI document, with examples of the table that is served and the path that a proxy adds."""
+    document: dict[str, Any] = request.app.openapi()
+    tables = services.tables.at_hand()
+    if tables:
+        table = tables[0].locator.table
+        document = await services.table_cache.get(
+            table.table_id, "openapi.json", lambda: with_site_examples(document, table)
+        )
+    if prefix := prefix_of(request.scope):
+        document = {**document, "servers": [{"url": prefix}]}
+    return JSONResponse(document, headers={"Cache-Control": "no-cache"})
 
 
 @router.api_route("/assets/{name:path}", methods=["GET", "HEAD"])

@@ -64,6 +64,11 @@ class FixDocument(BaseModel):
         "or because rounding made covariances singular; "
         "absent for nearly all reports",
     )
+    warnings: list[str] = Field(
+        default=[],
+        description="of an inconsistent fix: which measurements contradict the others, and what may be wrong with the "
+        "site; absent otherwise",
+    )
     table_id: str
     compute_ms: float = Field(description="time the fix itself took, ms")
     track: TrackDocument | None = Field(
@@ -118,6 +123,8 @@ def fix_to_document(fix: Fix, compute_seconds: float, track: TrackedPosition | N
     }
     if fix.simplified:
         document["simplified"] = list(fix.simplified)
+    if fix.warnings:
+        document["warnings"] = list(fix.warnings)
     if track is not None:
         document["track"] = track_to_document(track, confidence)
     return document

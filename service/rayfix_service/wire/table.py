@@ -7,7 +7,8 @@ from pydantic import BaseModel, Field
 
 from rayfix_service.wire.points import Point
 from rayfix_tables.level import Level
-from rayfix_tables.site import Station
+from rayfix_tables.mounting import boresight_of
+from rayfix_tables.site import Mounting, Station
 from rayfix_tables.table import Table
 
 
@@ -50,13 +51,24 @@ class OrientationSummary(BaseModel):
     slant_deg: float
 
 
+class BoresightSummary(BaseModel):
+    """Where a station's array looks."""
+
+    azimuth_deg: float = Field(description="in the scene frame")
+    downtilt_deg: float = Field(description="below the horizon")
+
+
 class StationSummary(BaseModel):
     """A station and its part of the table."""
 
     id: str
     position: Point
     orientation: OrientationSummary
-    field_of_view_deg: float = Field(description="full opening angle of the cone in which it measures")
+    mounting: Mounting = Field(description="which axes of its local frame are the boresight and the upper edge")
+    boresight: BoresightSummary
+    field_of_view_deg: float = Field(
+        description="full opening angle of the cone around the boresight that it measures in"
+    )
     levels: list[LevelSummary] = Field(description="finest first")
 
 
@@ -83,10 +95,13 @@ def station_summary(station: Station, levels: tuple[Level, ...]) -> StationSumma
     """Describe a station and its levels."""
     x, y, z = station.position
     bearing, downtilt, slant = (_degrees(angle) for angle in station.orientation)
+    boresight = boresight_of(station)
     return StationSummary(
         id=station.id,
         position=Point(x=x, y=y, z=z),
         orientation=OrientationSummary(bearing_deg=bearing, downtilt_deg=downtilt, slant_deg=slant),
+        mounting=station.mounting,
+        boresight=BoresightSummary(azimuth_deg=_degrees(boresight.azimuth), downtilt_deg=_degrees(boresight.downtilt)),
         field_of_view_deg=_degrees(station.field_of_view),
         levels=[
             LevelSummary(

@@ -3,14 +3,14 @@
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, cast, get_args
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
-from rayfix_tables.site import NO_BIAS, StationBias
+from rayfix_tables.site import NO_BIAS, Mounting, Station, StationBias
 
 FORMAT = "rayfix-table"
 FORMAT_VERSION = 2
@@ -96,6 +96,15 @@ def write_text(node: h5py.Group | h5py.Dataset, name: str, text: str) -> None:
 def read_text(node: h5py.Group | h5py.Dataset, name: str) -> str:
     """Read an attribute that is a text, of fixed or of variable length."""
     return str(_plain(node.attrs[name]))
+
+
+def read_mounting(attributes: Mapping[str, Any]) -> Mounting:
+    """Local frame of a station's array from the attributes of its group; that of 3GPP where it is missing."""
+    mounting = attributes.get("mounting", Station.mounting)
+    for known in get_args(Mounting):
+        if mounting == known:
+            return cast("Mounting", known)
+    raise ValueError(f"mounting is {mounting!r}; this version knows {', '.join(get_args(Mounting))}")
 
 
 def array_digest(array: NDArray[Any]) -> str:

@@ -9,6 +9,7 @@ import trimesh
 from rayfix_offline.build import BuildSummary, build_table
 from rayfix_tables.errors import BuildError, TableError
 from rayfix_tables.mixture import FIELD_SHAPES
+from rayfix_tables.mounting import boresight_of
 from rayfix_tables.table import Table
 
 SITE = """\
@@ -173,6 +174,37 @@ def test_another_field_of_view_keeps_the_cells_of_both(tmp_path: Path, former: P
         assert origin == "updated"
         assert 0.1 < share < 0.5
         assert summary.table_id == build_table(site, tmp_path / f"{view}.h5", jobs=1).table_id
+
+
+def turned(site: Path, keys: str) -> Path:
+    """Add keys to the left station."""
+    text = site.read_text(encoding="utf-8")
+    site.write_text(text.replace('id = "left"\n', f'id = "left"\n{keys}\n'), encoding="utf-8")
+    return site
+
+
+def test_a_turned_station_that_looks_all_around_is_kept(tmp_path: Path, former: Path) -> None:
+    site = turned(write_site(tmp_path), 'mounting = "silabs"\nboresight_azimuth_deg = 70\nroll_deg = 10')
+    summary = build_table(site, tmp_path / "t.h5", former=former, jobs=1)
+    assert [s.origin for s in summary.stations] == ["kept", "kept"]
+    part = Table.open(summary.path).parts["left"]
+    assert part.station.mounting == "silabs"
+    assert np.rad2deg(part.station.orientation) == pytest.approx((160.0, -10.0, 90.0), abs=1e-9)
+    assert np.rad2deg(boresight_of(part.station)) == pytest.approx((70.0, 0.0), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_of_a_turned_station_only_what_comes_into_view_is_built(tmp_path: Path, former: Path) -> None:
+    looks = turned(write_site(tmp_path / "first", view=120), "boresight_azimuth_deg = 45")
+    first = build_table(looks, tmp_path / "first.h5", former=former, jobs=1)
+    _, in_view = station(first, "left")
+    for keys, expected in (("boresight_azimuth_deg = 75", "updated"), ("orientation_deg = [45, 0, 30]", "kept")):
+        site = turned(write_site(tmp_path, view=120), keys)
+        summary = build_table(site, tmp_path / "t.h5", former=first.path, jobs=1)
+        origin, share = station(summary, "left")
+        assert origin == expected
+        assert 0.6 * in_view < share < (0.9 if expected == "updated" else 1.1) * in_view
+        assert summary.table_id == build_table(site, tmp_path / f"{origin}.h5", jobs=1).table_id
 
 
 @pytest.mark.slow

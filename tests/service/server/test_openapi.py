@@ -8,9 +8,11 @@ import pytest
 
 from rayfix_service.http.openapi.examples import (
     BATCH_EXAMPLES,
+    NRPPA_BATCH_EXAMPLES,
     NRPPA_EXAMPLES,
     PROBLEM_EXAMPLE,
     REPORT_EXAMPLES,
+    SILABS_BATCH_EXAMPLES,
     SILABS_EXAMPLES,
     UBLOX_EXAMPLES,
 )
@@ -40,7 +42,8 @@ def test_every_example_of_the_openapi_document_works(hall_app: RunningApp, opena
                 assert fix["status"] in ("ok", "ambiguous")
                 assert all(measurement["used"] for measurement in fix["measurements"])
             tried += 1
-    examples = (REPORT_EXAMPLES, BATCH_EXAMPLES, NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES)
+    singles = (REPORT_EXAMPLES, NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES)
+    examples = (*singles, BATCH_EXAMPLES, NRPPA_BATCH_EXAMPLES, SILABS_BATCH_EXAMPLES)
     assert tried == sum(len(group) for group in examples)
 
 
@@ -70,12 +73,14 @@ def test_every_error_of_the_openapi_document_is_a_problem(openapi: dict[str, Any
         "/v1/positions": position,
         "/v1/positions/batch": position,
         "/v1/positions/nrppa": position,
+        "/v1/positions/nrppa/batch": position,
         "/v1/positions/silabs": position,
+        "/v1/positions/silabs/batch": position,
         "/v1/positions/ublox": position - {"400"},
         "/v1/fixes": {"200", "401", "404", "422", "503"},
         "/v1/table": {"200", "401", "404", "422", "503"},
-        "/v1/tables": {"200", "401", "503"},
-        "/v1/tables/reload": {"200", "401", "409", "429"},
+        "/v1/tables": {"200", "401", "422", "503"},
+        "/v1/tables/reload": {"200", "401", "409", "422", "429"},
         "/v1/stations": {"200", "401", "404", "422", "503"},
         "/v1/viewer": {"200", "401", "404", "422", "503"},
         "/v1/scene.glb": {"200", "401", "404", "422", "503"},
@@ -83,9 +88,9 @@ def test_every_error_of_the_openapi_document_is_a_problem(openapi: dict[str, Any
         "/v1/stations/{station_id}/coverage": {"200", "401", "404", "422", "429", "503", "504"},
         "/v1/simulations": position | {"403"},
         "/v1/posteriors": position,
-        "/livez": {"200"},
-        "/readyz": {"200", "503"},
-        "/metrics": {"200", "401"},
+        "/livez": {"200", "422"},
+        "/readyz": {"200", "422", "503"},
+        "/metrics": {"200", "401", "422"},
     }
 
 

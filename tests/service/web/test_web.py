@@ -94,8 +94,9 @@ def test_the_scene_is_given_once(web: RunningApp, table: Table):
 
 def test_the_mixture_of_a_direction_is_what_the_fusion_uses(web: RunningApp, table: Table):
     """An angle alone gives a posterior that is the mixture, before it is cut to the free space."""
-    angle = {"station_id": "bs1", "azimuth_deg": 60.0, "zenith_deg": 97.0}
-    document = web.get("/v1/stations/bs1/mixture", params={**angle, "stdev_deg": 1.0, "limit": 512}).json()
+    direction = {"azimuth_deg": 60.0, "zenith_deg": 97.0}
+    angle = {"station_id": "bs1", **direction}
+    document = web.get("/v1/stations/bs1/mixture", params={**direction, "stdev_deg": 1.0, "limit": 512}).json()
     probability = np.array([c["probability"] for c in document["components"]])
     assert probability.sum() == pytest.approx(1.0, abs=1e-6)
     assert np.all(np.diff(probability) <= 0.0)

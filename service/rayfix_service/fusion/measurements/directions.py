@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.measurements.report import Angle
 from rayfix_tables.angles import angles_of, direction, local_to_scene
+from rayfix_tables.mounting import board_to_scene
 from rayfix_tables.site import NO_BIAS, Station
 
 
@@ -99,7 +100,7 @@ def in_field_of_view(station: Station, measured: Direction) -> bool:
     """Whether a direction lies within the station's cone; one without zenith always counts as inside."""
     if station.field_of_view >= 2.0 * np.pi or measured.azimuth is None or measured.zenith is None:
         return True
-    axis = local_to_scene(station.orientation)[:, 0]
+    axis = board_to_scene(station)[:, 0]
     cosine = float(axis @ direction(measured.azimuth, measured.zenith))
     return bool(np.arccos(np.clip(cosine, -1.0, 1.0)) <= 0.5 * station.field_of_view)
 

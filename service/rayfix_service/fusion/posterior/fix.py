@@ -75,6 +75,9 @@ class Fix:
     simplified : tuple of str
         What was worked out more coarsely than the report says, since the work per report is bounded or because
         rounding made covariances singular; mostly empty.
+    warnings : tuple of str
+        Of an inconsistent fix: which measurements contradict the others, and which turn of stations would make them
+        agree.
     """
 
     status: Status
@@ -85,6 +88,7 @@ class Fix:
     regions: "CredibleRegions | None" = None
     confidence: float = CONFIDENCE
     simplified: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     target_id: str | None = None
     timestamp: str | None = None
 

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from time import perf_counter
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic_core import from_json, to_json
 
@@ -15,15 +15,15 @@ from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.omlox_hub import OmloxHub
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix
-from rayfix_service.fusion.posterior.fused import Fused
-from rayfix_service.fusion.stopping import NEVER
+from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.response_options import ResponseOptions
 from rayfix_service.http.answering.served_tables import ServedTable
-from rayfix_service.http.answering.slow_work import SlowWork, Stoppable
+from rayfix_service.http.answering.slow_work import SlowWork
 from rayfix_service.http.problems import ProblemError, internal_problem, problem_document, report_problem
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.telemetry.metrics import Metrics
+from rayfix_service.locator import Locator
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report, report_to_document
 from rayfix_service.wire.problems import MAX_PROBLEMS
@@ -151,23 +151,33 @@ class Answerer:
         """
         report = incoming.report
         locator = table.locator
-        locate = cast("Stoppable[Report, Fix | Fused]", locator.fuse if options.follows(report) else locator.locate)
-        quick = table.locator.seconds(report) <= self.quick_seconds
+        quick = locator.seconds(report) <= self.quick_seconds
         start = perf_counter()
         try:
-            found: Fix | Fused
-            found = locate(report, stop=NEVER) if quick else await self.slow_work.locate(locate, report)
+            fused = locator.fuse(report, stop=NEVER) if quick else await self.slow_work.locate(locator.fuse, report)
             seconds = perf_counter() - start
-            fix = found.fix if isinstance(found, Fused) else found
-            self.metrics.fix_done(fix, seconds)
-            track = table.tracker.follow(found) if isinstance(found, Fused) else None
+            self.metrics.fix_done(fused.fix, seconds)
+            track = table.tracker.follow(fused) if options.follows(report) else None
         except ReportError as error:
             if incoming.adapted is None:
                 raise
             raise error_in_message(error, incoming.adapted) from None
         if track is not None:
             self.metrics.track_done(track.state)
-        return Located(fix, track, seconds)
+        return Located(await self._explained(locator, report, fused.fix), track, seconds)
+
+    async def _explained(self, locator: Locator, report: Report, fix: Fix) -> Fix:
+        """Look in a thread for what may be wrong with the site, where a fix is inconsistent and no other work waits."""
+        if fix.status != "inconsistent" or self.slow_work.under_way:
+            return fix
+
+        def explain(report: Report, *, stop: Stop) -> Fix:
+            return locator.explain(report, fix, stop=stop)
+
+        try:
+            return await self.slow_work.locate(explain, report)
+        except ProblemError:  # too busy, or too long: the fix itself is there
+            return fix
 
     def write(
         self, table: ServedTable, incoming: Incoming, options: ResponseOptions, located: Located
@@ -184,7 +194,10 @@ class Answerer:
         site = table.site
         if self.hub is not None:
             self.hub.tell(fix, site, track)
-        return write(fix, options.output, site, compute_seconds=seconds, adapted=incoming.adapted, track=track)
+        answer = write(fix, options.output, site, compute_seconds=seconds, adapted=incoming.adapted, track=track)
+        if options.with_report and options.output == "native":
+            answer["report"] = incoming.native_document()
+        return answer
 
     async def answer_or_problem(
         self, table: ServedTable, make: Callable[[], Incoming | Awaitable[Incoming]], options: ResponseOptions

@@ -33,12 +33,15 @@ class ResponseOptions:
         Whether targets are followed.
     must_track : bool
         Whether the request itself asks for it: a report that cannot be followed is then refused.
+    with_report : bool
+        Whether a native answer to another system's message has the report that it was turned into.
     """
 
     output: OutputFormat = "native"
     media_type: str = JSON
     track: bool = False
     must_track: bool = False
+    with_report: bool = False
 
     def follows(self, report: Report) -> bool:
         """Whether a report is to be followed."""

@@ -235,6 +235,10 @@ class Tables:
             While none may answer.
         """
         self._require_ready()
+        return self.at_hand()
+
+    def at_hand(self) -> "tuple[ServedTable, ...]":
+        """Return all tables that are checked already, sorted by name; none at the beginning."""
         return tuple(self._served.values())
 
     def named(self, name: str | None) -> ServedTable:

@@ -243,6 +243,14 @@ NRPPA_EXAMPLES: dict[str, dict[str, Any]] = {
 }
 """Bodies of ``POST /v1/positions/nrppa``."""
 
+NRPPA_BATCH_EXAMPLES: dict[str, dict[str, Any]] = {
+    "one_message": {
+        "summary": "A batch of one message",
+        "value": {"reports": [NRPPA_EXAMPLES["ul_aoa_and_ul_rtoa"]["value"]]},
+    },
+}
+"""Bodies of ``POST /v1/positions/nrppa/batch``."""
+
 
 def _silabs(locator_id: str, azimuth: float, elevation: float) -> dict[str, Any]:
     return {
@@ -273,6 +281,14 @@ SILABS_EXAMPLES: dict[str, dict[str, Any]] = {
     }
 }
 """Bodies of ``POST /v1/positions/silabs``."""
+
+SILABS_BATCH_EXAMPLES: dict[str, dict[str, Any]] = {
+    "one_message": {
+        "summary": "A batch of one message",
+        "value": {"reports": [SILABS_EXAMPLES["three_locators"]["value"]]},
+    },
+}
+"""Bodies of ``POST /v1/positions/silabs/batch``."""
 
 UBLOX_EXAMPLES: dict[str, dict[str, Any]] = {
     "three_anchors": {

@@ -23,7 +23,7 @@ from rayfix_service.http.problems import (
     UNSUPPORTED_MEDIA_TYPE,
     problem_responses,
 )
-from rayfix_service.wire import FixDocument, Point
+from rayfix_service.wire import FixDocument, Point, ReportDocument
 from rayfix_service.wire.response import OutcomeDocument
 
 
@@ -45,6 +45,10 @@ class AdaptedFixDocument(FixDocument):
 
     measurements: list[AdaptedOutcome]  # type: ignore[assignment]
     skipped: list[SkippedDocument]
+    report: ReportDocument | None = Field(
+        default=None,
+        description="the report that the message was turned into; only with the query parameter with_report",
+    )
 
 
 class LocalOrigin(BaseModel):

@@ -5,6 +5,7 @@ which costs more than they do.
 """
 
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from typing import Annotated
 
 from fastapi import Depends, Query, Request
@@ -84,6 +85,19 @@ async def get_response_options(
 
 
 ResponseOptionsDep = Annotated[ResponseOptions, Depends(get_response_options)]
+
+
+async def get_message_options(
+    options: ResponseOptionsDep,
+    with_report: Annotated[
+        bool, Query(description="whether a native answer also has the report that the message was turned into")
+    ] = False,
+) -> ResponseOptions:
+    """Read what a request with another system's message wants."""
+    return replace(options, with_report=True) if with_report else options
+
+
+MessageOptionsDep = Annotated[ResponseOptions, Depends(get_message_options)]
 
 
 def body_reader(limit_of: Callable[[BodyLimits], int], *, text: bool = False) -> Callable[[Request], Awaitable[bytes]]:

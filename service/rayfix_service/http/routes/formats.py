@@ -1,20 +1,26 @@
 """Routes that locate from messages of other systems; docs/formats.md describes them."""
 
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, Field
 
-from rayfix_service.adapters.adapted import known_height, station_map, with_height
+from rayfix_service.adapters.adapted import known_height, station_map
+from rayfix_service.adapters.formats import parse
 from rayfix_service.adapters.nrppa import parse_nrppa
-from rayfix_service.adapters.nrppa_documents import NrppaDocument
-from rayfix_service.adapters.silabs import SilabsDocument, parse_silabs
-from rayfix_service.adapters.ublox import parse_ublox
+from rayfix_service.adapters.nrppa_documents import NrppaBatchDocument, NrppaDocument
+from rayfix_service.adapters.silabs import SilabsBatchDocument, SilabsDocument, parse_silabs
 from rayfix_service.http.access.guard import charge_reports
 from rayfix_service.http.answering.cooperative import Cooperation
-from rayfix_service.http.answering.locating import foreign
-from rayfix_service.http.openapi.examples import NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
+from rayfix_service.http.answering.locating import Incoming, foreign
+from rayfix_service.http.openapi.examples import (
+    NRPPA_BATCH_EXAMPLES,
+    NRPPA_EXAMPLES,
+    SILABS_BATCH_EXAMPLES,
+    SILABS_EXAMPLES,
+    UBLOX_EXAMPLES,
+)
 from rayfix_service.http.openapi.responses import (
     ADAPTED_ANSWER,
     POSITION_PROBLEMS,
@@ -22,15 +28,23 @@ from rayfix_service.http.openapi.responses import (
     request_body,
 )
 from rayfix_service.http.problems import MALFORMED_JSON, Problem
-from rayfix_service.http.routes.dependencies import AnswererDep, LinesBody, ReportBody, ResponseOptionsDep, TableDep
+from rayfix_service.http.routes.batches import answer_batch
+from rayfix_service.http.routes.dependencies import (
+    AnswererDep,
+    BatchBody,
+    LinesBody,
+    MessageOptionsDep,
+    ReportBody,
+    TableDep,
+)
 from rayfix_service.http.routes.json_answer import JsonAnswer
 from rayfix_service.http.routes.one_report import answer_one
 
 router = APIRouter(prefix="/v1/positions", tags=["formats"])
 
 
-class LinesResult(BaseModel):
-    """The answers to lines, one for each transmission of each tag."""
+class MessagesResult(BaseModel):
+    """The answers to messages in their order, or to lines, one for each transmission of each tag."""
 
     results: list[AdaptedOrOther | Problem] = Field(
         description="a fix in the format of the query parameter output, or the problem of that report"
@@ -45,7 +59,7 @@ class LinesResult(BaseModel):
     openapi_extra=request_body(NrppaDocument, NRPPA_EXAMPLES),
 )
 async def post_nrppa(
-    answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
+    answerer: AnswererDep, table: TableDep, body: ReportBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
     return await answer_one(lambda text: foreign(parse_nrppa(text)), body, answerer, table, options)
@@ -59,16 +73,52 @@ async def post_nrppa(
     openapi_extra=request_body(SilabsDocument, SILABS_EXAMPLES),
 )
 async def post_silabs(
-    answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
+    answerer: AnswererDep, table: TableDep, body: ReportBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
     return await answer_one(lambda text: foreign(parse_silabs(text)), body, answerer, table, options)
 
 
 @router.post(
+    "/nrppa/batch",
+    summary="Locate from many NRPPa messages",
+    response_model=MessagesResult,
+    responses=POSITION_PROBLEMS,
+    openapi_extra=request_body(NrppaBatchDocument, NRPPA_BATCH_EXAMPLES),
+)
+async def post_nrppa_batch(
+    request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: MessageOptionsDep
+) -> JsonAnswer:
+    """Locate each message on its own; one that cannot be used gets a problem and leaves the others alone."""
+    return JsonAnswer({"results": await answer_batch(request, answerer, table, body, options, _read_nrppa)})
+
+
+@router.post(
+    "/silabs/batch",
+    summary="Locate from many packets of Silicon Labs locators",
+    response_model=MessagesResult,
+    responses=POSITION_PROBLEMS,
+    openapi_extra=request_body(SilabsBatchDocument, SILABS_BATCH_EXAMPLES),
+)
+async def post_silabs_batch(
+    request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: MessageOptionsDep
+) -> JsonAnswer:
+    """Locate each packet on its own; one that cannot be used gets a problem and leaves the others alone."""
+    return JsonAnswer({"results": await answer_batch(request, answerer, table, body, options, _read_silabs)})
+
+
+def _read_nrppa(text: bytes, most_problems: int) -> Incoming:
+    return foreign(parse_nrppa(text))
+
+
+def _read_silabs(text: bytes, most_problems: int) -> Incoming:
+    return foreign(parse_silabs(text))
+
+
+@router.post(
     "/ublox",
     summary="Locate from u-blox anchors",
-    response_model=LinesResult,
+    response_model=MessagesResult,
     responses={status: problem for status, problem in POSITION_PROBLEMS.items() if status != MALFORMED_JSON.status},
     openapi_extra={
         "requestBody": {
@@ -82,17 +132,22 @@ async def post_ublox(
     answerer: AnswererDep,
     table: TableDep,
     body: LinesBody,
-    options: ResponseOptionsDep,
+    options: MessageOptionsDep,
     station: Annotated[list[str], Query(description="ANCHOR=STATION, for anchors whose id is no station's")] = [],  # noqa: B006
     height_m: Annotated[float | None, Query(description="known height of the tags, z in the scene frame, m")] = None,
     height_stdev_m: Annotated[float | None, Query(description="its standard deviation, m")] = None,
+    confidence: Annotated[
+        float | None,
+        Query(description="probability with which accuracies are to hold, 0.01 to 0.99; 0.68 unless given"),
+    ] = None,
 ) -> JsonAnswer:
-    """Take ``+UUDF`` lines of u-blox anchors and join them by tag and sequence number."""
-    known, results = known_height(height_m, height_stdev_m), []
-    messages = await answerer.read(partial(parse_ublox, stations=station_map(station)), body)
+    """Take ``+UUDF`` lines of u-blox anchors, join them by tag and sequence number, and locate each transmission."""
+    known, results = known_height(height_m, height_stdev_m), list[dict[str, Any]]()
+    read = partial(parse, input_format="ublox", stations=station_map(station), height=known, confidence=confidence)
+    messages = await answerer.read(read, body)
     charge_reports(request, len(messages))
     cooperation = Cooperation(request)
     for adapted in messages:
         await cooperation.let_others_run()
-        results.append(await answerer.answer_or_problem(table, partial(foreign, with_height(adapted, known)), options))
+        results.append(await answerer.answer_or_problem(table, partial(foreign, adapted), options))
     return JsonAnswer({"results": results})

@@ -1,21 +1,18 @@
 """Routes that locate."""
 
 import asyncio
-from functools import partial
-from typing import Any
 
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 from starlette.datastructures import State
 from starlette.types import Receive, Scope
 
-from rayfix_service.http.access.guard import charge_reports
-from rayfix_service.http.answering.cooperative import Cooperation
-from rayfix_service.http.answering.locating import Incoming, native, problem_of
+from rayfix_service.http.answering.locating import Incoming, native
 from rayfix_service.http.answering.response_options import response_options_of
 from rayfix_service.http.openapi.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
 from rayfix_service.http.openapi.responses import NATIVE_ANSWER, POSITION_PROBLEMS, NativeOrOther, request_body
 from rayfix_service.http.problems import Problem
+from rayfix_service.http.routes.batches import answer_batch
 from rayfix_service.http.routes.dependencies import (
     AnswererDep,
     BatchBody,
@@ -27,9 +24,7 @@ from rayfix_service.http.routes.dependencies import (
 from rayfix_service.http.routes.json_answer import JsonAnswer, write_json
 from rayfix_service.http.routes.one_report import answer_one
 from rayfix_service.http.services import services_in
-from rayfix_service.wire import BatchDocument, MalformedJsonError, ReportDocument
-from rayfix_service.wire.batches import split_batch
-from rayfix_service.wire.problems import MAX_PROBLEMS
+from rayfix_service.wire import BatchDocument, ReportDocument
 
 
 class BatchResult(BaseModel):
@@ -89,31 +84,8 @@ async def post_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
-    texts = await answerer.read(split_batch, body)
-    charge_reports(request, len(texts))
-    cooperation = Cooperation(request)
-    reports: list[Incoming | dict[str, Any]] = []  # all, before the first is located: a batch is JSON or it is not
-    listed = 0
-    for number, text in enumerate(texts):
-        await cooperation.let_others_run()
-        read = partial(native, most_problems=MAX_PROBLEMS if listed < MAX_PROBLEMS else 1)
-        try:
-            reports.append(await answerer.read(read, text))
-        except MalformedJsonError as error:
-            raise MalformedJsonError(f"reports[{number}]: {error}") from None
-        except Exception as error:
-            problem = problem_of(error)
-            reports.append(problem)
-            listed += len(problem["errors"])
-    results: list[dict[str, Any]] = []
-    for report in reports:  # not by locate_batch: other batches keep the other workers, one for each core, as busy
-        if isinstance(report, Incoming):
-            await cooperation.let_others_run()
-            results.append(await answerer.answer_or_problem(table, partial(_itself, report), options))
-        else:
-            results.append(report)
-    return JsonAnswer({"results": results})
+    return JsonAnswer({"results": await answer_batch(request, answerer, table, body, options, _read_native)})
 
 
-def _itself(report: Incoming) -> Incoming:
-    return report
+def _read_native(text: bytes, most_problems: int) -> Incoming:
+    return native(text, most_problems=most_problems)

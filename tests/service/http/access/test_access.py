@@ -260,7 +260,7 @@ def test_other_origins_are_closed_unless_named(hall_table_path: Path, keys: tupl
 
 def test_slow_fixes_are_bounded_and_fast_ones_go_on(hall_table_path: Path, monkeypatch: pytest.MonkeyPatch):
     gate = threading.Event()
-    locate = Locator.locate
+    locate = Locator.fuse
 
     def wait_and_locate(self: Locator, report: Any, *, stop: Any) -> Any:
         if threading.current_thread().name.startswith("slow-fix"):
@@ -269,7 +269,7 @@ def test_slow_fixes_are_bounded_and_fast_ones_go_on(hall_table_path: Path, monke
 
     settings = {"slow_fix_threads": 1, "slow_fixes_waiting": 1, "fix_seconds": 0.3, "quick_fix_seconds": 0.0021}
     with RunningApp(hall_table_path, **settings) as service:
-        monkeypatch.setattr(Locator, "locate", wait_and_locate)
+        monkeypatch.setattr(Locator, "fuse", wait_and_locate)
 
         async def together() -> list[httpx.Response]:
             slow = [asyncio.create_task(service.http.post("/v1/positions", json=RANGES)) for _ in range(2)]

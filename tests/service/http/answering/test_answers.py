@@ -3,6 +3,7 @@
 import asyncio
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -211,8 +212,34 @@ def test_the_stations_are_listed(hall_app: RunningApp, hall_table_path: Path):
         part = table.parts[station["id"]]
         assert tuple(station["position"].values()) == part.station.position
         assert list(station["orientation"]) == ["bearing_deg", "downtilt_deg", "slant_deg"]
+        assert station["mounting"] == "3gpp"
+        assert station["boresight"]["azimuth_deg"] == pytest.approx(station["orientation"]["bearing_deg"])
+        assert station["boresight"]["downtilt_deg"] == pytest.approx(station["orientation"]["downtilt_deg"])
         assert station["field_of_view_deg"] == pytest.approx(math.degrees(part.station.field_of_view))
         assert [level["num_cells"] for level in station["levels"]] == [level.num_cells for level in part.levels]
         windows = [level["window_deg"] for level in station["levels"]]
         assert windows == sorted(windows)
         assert windows == pytest.approx([math.degrees(level.window) for level in part.levels])
+
+
+def turned_report(turn_deg: float) -> dict[str, Any]:
+    """Angles and times of three stations that see (7, 4, 1.5), with azimuths counted from elsewhere."""
+    seen = {"bs1": (29.47, 96.49, 7.97), "bs2": (103.0, 102.67, 4.10), "bs3": (-93.70, 93.70, 13.96)}
+    measurements: list[dict[str, Any]] = []
+    for name, (azimuth, zenith, length) in seen.items():
+        deviations = {"azimuth_stdev_deg": 1.0, "zenith_stdev_deg": 1.0}
+        angles = {"azimuth_deg": azimuth - turn_deg, "zenith_deg": zenith, **deviations}
+        measurements.append({"type": "aoa", "station_id": name, **angles})
+        measurements.append({"type": "pt", "station_id": name, "range_m": length, "stdev_m": 0.5})
+    return {"measurements": measurements}
+
+
+def test_an_inconsistent_fix_names_its_suspects_and_the_turn(hall_app: RunningApp):
+    document = hall_app.post("/v1/positions", turned_report(40.0)).json()
+    assert document["status"] == "inconsistent"
+    suspects, turn = document["warnings"]
+    assert re.search(r"the angle of station 'bs[123]' \(measurements\[\d\]\)", suspects)
+    assert "the angles of all stations by +40 +- 1 deg" in turn
+    omlox = hall_app.post("/v1/positions?output=omlox", turned_report(40.0)).json()
+    assert omlox["properties"]["rayfix.warnings"] == document["warnings"]
+    assert "warnings" not in hall_app.post("/v1/positions", turned_report(0.0)).json()

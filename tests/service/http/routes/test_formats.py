@@ -96,6 +96,8 @@ def test_a_known_height_moves_the_fix_there(hall_app: RunningApp):
         ("/v1/positions/nrppa", LINES, 415, None, "application/json"),
         ("/v1/positions/ublox", NRPPA, 415, None, "text/plain"),
         ("/v1/positions/ublox", "OK", 422, None, "no line holds +UUDF:"),
+        ("/v1/positions/ublox?confidence=2", LINES, 422, "confidence", "0.01 to 0.99"),
+        ("/v1/positions/silabs", {**SILABS, "confidence": 1.0}, 422, "confidence", "to hold"),
         ("/v1/positions/ublox?station=a", LINES, 422, "station", "NAME=STATION"),
         ("/v1/positions/ublox?height_m=1", LINES, 422, "height", "give both numbers"),
         ("/v1/positions/silabs", {**SILABS, "angles": []}, 422, "angles", "an array of 1 to 256 angles"),
@@ -118,3 +120,68 @@ def test_without_position_there_is_a_problem_instead(hall_app: RunningApp):
     response = post(hall_app, "/v1/positions?output=omlox", report)
     assert response.status_code == 422
     assert "ask for the native one" in response.json()["detail"]
+
+
+def test_accuracies_hold_with_the_confidence_that_a_message_wants(hall_app: RunningApp):
+    (lines,) = post(hall_app, "/v1/positions/ublox?confidence=0.95", LINES).json()["results"]
+    (usual,) = post(hall_app, "/v1/positions/ublox", LINES).json()["results"]
+    pairs = [(lines, usual)]
+    for path, body in (("/v1/positions/nrppa", NRPPA), ("/v1/positions/silabs", SILABS)):
+        pairs.append(tuple(post(hall_app, path, {**body, **more}).json() for more in ({"confidence": 0.95}, {})))
+    for wanted, plain in pairs:
+        assert (wanted["confidence"], plain["confidence"]) == (pytest.approx(0.95, abs=0.02), pytest.approx(0.68))
+        assert wanted["horizontal_accuracy_m"] > 1.3 * plain["horizontal_accuracy_m"]
+        assert wanted["position"] == plain["position"]
+
+
+@pytest.mark.parametrize(("path", "body"), [("/v1/positions/nrppa", NRPPA), ("/v1/positions/silabs", SILABS)])
+def test_a_batch_of_messages_is_answered_in_its_order(hall_app: RunningApp, path: str, body: dict[str, Any]):
+    batch = {"reports": [body, {"confidence": "much", "colour": 1}, {**body, "target_id": "last"}]}
+    response = post(hall_app, f"{path}/batch", batch)
+    assert response.status_code == 200
+    first, refused, last = response.json()["results"]
+    alone = post(hall_app, path, body).json()
+    assert {**first, "compute_ms": 0} == {**alone, "compute_ms": 0}
+    assert refused["status"] == 422
+    assert "colour" in [error["path"] for error in refused["errors"]]
+    assert (last["target_id"], last["position"]) == ("last", alone["position"])
+    torn = hall_app.post_bytes(f"{path}/batch", '{"reports": [{]}', {"content-type": "application/json"})
+    assert torn.status_code == 400
+
+
+def test_the_problems_of_a_batch_of_messages_stay_short(hall_app: RunningApp):
+    wrong = {f"key-{n}": 1 for n in range(40)}
+    results = post(hall_app, "/v1/positions/silabs/batch", {"reports": [wrong] * 20}).json()["results"]
+    assert sum(len(problem["errors"]) for problem in results) < 120
+    assert len(results[-1]["errors"]) == 1
+    assert results[-1]["more_errors"] >= 39
+
+
+def test_a_message_comes_back_as_the_report_that_it_was_turned_into(hall_app: RunningApp):
+    for path, body in (("nrppa", NRPPA), ("silabs", SILABS), ("ublox", LINES)):
+        answer = post(hall_app, f"/v1/positions/{path}?with_report=true", body).json()
+        fix = answer.get("results", [answer])[0]
+        again = post(hall_app, "/v1/positions", fix["report"]).json()
+        assert list(again["position"].values()) == pytest.approx(list(fix["position"].values()), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "known"),
+    [
+        ("POST", "/v1/positions?ouput=omlox", "did you mean output? The path knows output, table, track"),
+        ("POST", "/v1/positions/batch?confidence=0.9", "the path knows output, table, track"),
+        ("POST", "/v1/positions/silabs?confidence=0.9", "the path knows output, table, track, with_report"),
+        ("GET", "/v1/tables?table=hall", "the path knows none"),
+        ("GET", "/v1/stations?name=bs1", "the path knows table"),
+        ("GET", "/v1/fixes?target=agv-7", "did you mean target_id? The path knows table, target_id"),
+        ("GET", "/livez?verbose", "the path knows none"),
+    ],
+)
+def test_unknown_query_parameters_are_refused(hall_app: RunningApp, method: str, path: str, known: str):
+    response = hall_app.post(path, REPORT) if method == "POST" else hall_app.get(path)
+    assert response.status_code == 422
+    problem = response.json()
+    assert problem["type"] == "urn:rayfix:problem:invalid-parameter"
+    name = path.split("?")[1].split("=")[0]
+    assert problem["detail"] == f"there is no query parameter '{name}'; {known}"
+    assert [error["path"] for error in problem["errors"]] == [name]

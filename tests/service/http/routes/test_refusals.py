@@ -195,7 +195,7 @@ def test_a_defect_says_nothing_of_its_cause(
         raise RuntimeError("secret of /etc/secret")
 
     with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
-        patch.setattr(Locator, "locate", fail)
+        patch.setattr(Locator, "fuse", fail)
         response = hall_app.post("/v1/positions", REPORT)
         batch = hall_app.post("/v1/positions/batch", {"reports": [REPORT, {}]})
     assert "log" in problem_of(response, 500)["detail"]

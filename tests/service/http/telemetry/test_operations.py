@@ -181,7 +181,7 @@ def test_a_defect_is_logged_with_its_request(service: RunningApp, monkeypatch: p
 
     counted = ("rayfix_http_requests_total", "POST", "/v1/positions", "500")
     before = figures_of(service).get(counted, 0)
-    monkeypatch.setattr(Locator, "locate", fail)
+    monkeypatch.setattr(Locator, "fuse", fail)
     log = io.StringIO()
     handler = logging.StreamHandler(log)
     handler.setFormatter(JsonFormatter())

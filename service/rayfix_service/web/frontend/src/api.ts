@@ -1,5 +1,6 @@
 /** Talks to the service that gave the page, and to nothing else. */
 
+import type { Posting } from "./messages";
 import type {
   Coverage,
   Fix,
@@ -15,6 +16,7 @@ import type {
 
 const KEY = "rayfix-api-key";
 const RETRY = 2000; // ms
+const TABLES = "v1/tables"; // the only path that takes no name of a table
 
 interface Problem {
   title: string;
@@ -55,7 +57,7 @@ export class Api {
   /** The table that is asked of, once one is chosen. */
   table: string | null = null;
 
-  tables = async (): Promise<TableInfo[]> => (await this.json<{ tables: TableInfo[] }>("v1/tables")).tables;
+  tables = async (): Promise<TableInfo[]> => (await this.json<{ tables: TableInfo[] }>(TABLES)).tables;
 
   stations = async (): Promise<StationInfo[]> =>
     (await this.json<{ stations: StationInfo[] }>("v1/stations")).stations;
@@ -64,7 +66,20 @@ export class Api {
 
   scene = async (): Promise<ArrayBuffer> => (await this.fetch("v1/scene.glb")).arrayBuffer();
 
-  locate = (report: unknown): Promise<Fix> => this.post("v1/positions", report);
+  /** Post a report or another system's message; gives each fix with its report, and what was wrong with others. */
+  async locate(posting: Posting): Promise<{ located: Simulated[]; problems: string[] }> {
+    const init = { method: "POST", headers: { "content-type": posting.contentType }, body: posting.body };
+    const answer = await this.json<Fix | { results: (Fix | Problem)[] }>(posting.path, init);
+    if (!("results" in answer)) return { located: [withReport(answer, posting.report)], problems: [] };
+    const reports = (posting.report as { reports?: unknown[] } | null)?.reports;
+    const located: Simulated[] = [];
+    const problems: string[] = [];
+    answer.results.forEach((one, n) => {
+      if ("errors" in one) problems.push(`${n + 1}: ${one.detail}`);
+      else located.push(withReport(one as Fix, reports?.[n]));
+    });
+    return { located, problems };
+  }
 
   posterior = (report: Report, signal: AbortSignal): Promise<Posterior> => this.post("v1/posteriors", report, signal);
 
@@ -124,7 +139,7 @@ export class Api {
     if (this.key !== null) headers.set("Authorization", `Bearer ${this.key}`);
     let response: Response;
     const url = new URL(path, location.href);
-    if (this.table !== null) url.searchParams.set("table", this.table);
+    if (this.table !== null && path !== TABLES) url.searchParams.set("table", this.table);
     try {
       response = await fetch(url, { ...init, headers });
     } catch (error) {
@@ -135,6 +150,11 @@ export class Api {
     const retry = Number(response.headers.get("retry-after")) || null;
     throw new ServiceError(await problemText(response), response.status, retry);
   }
+}
+
+/** The report of a fix: the one that was posted, or what the service turned the message into. */
+function withReport(fix: Fix & { report?: Report }, posted: unknown): Simulated {
+  return { report: fix.report ?? (posted as Report), fix };
 }
 
 async function problemText(response: Response): Promise<string> {

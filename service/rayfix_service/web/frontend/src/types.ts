@@ -23,6 +23,7 @@ export interface StationInfo {
   id: string;
   position: Point;
   orientation: { bearing_deg: number; downtilt_deg: number; slant_deg: number };
+  boresight: { azimuth_deg: number; downtilt_deg: number };
   field_of_view_deg: number;
   levels: { window_deg: number; num_cells: number; num_components: number }[];
 }
@@ -76,6 +77,8 @@ export interface Fix {
   confidence: number;
   candidates: Candidate[];
   measurements: Outcome[];
+  /** Of an inconsistent fix; absent otherwise. */
+  warnings?: string[];
   table_id: string;
   compute_ms: number;
 }

@@ -12,10 +12,11 @@ import { Selection } from "./scene/selection";
 import type { Stage } from "./scene/stage";
 import { Stations } from "./scene/stations";
 import { Targets } from "./scene/targets";
+import { postingOf } from "./messages";
 import { Store } from "./store";
 import { theme } from "./theme";
 import { Mirrors } from "./trace/mirrors";
-import type { FixEvent, Mesh, Point, Report, Site, TableInfo, Vec3 } from "./types";
+import type { FixEvent, Mesh, Point, Site, TableInfo, Vec3 } from "./types";
 import { Dialogs } from "./ui/dialogs";
 import { FixPanel } from "./ui/fixpanel";
 import { Inspector } from "./ui/inspector";
@@ -246,17 +247,12 @@ export class Viewer {
     if (this.api !== null) this.dialogs.paste((text) => this.locate(text));
   }
 
-  /** Locate a report given as text. */
+  /** Locate a report, a batch or another system's message given as text. */
   private async locate(text: string): Promise<void> {
-    let report: Report;
-    try {
-      report = JSON.parse(text) as Report;
-    } catch (error) {
-      throw new Error(`This is not JSON: ${(error as Error).message}`, { cause: error });
-    }
-    const fix = await this.api!.locate(report);
-    this.show("fixes");
-    this.store.add({ report, fix, source: "posted" });
+    const { located, problems } = await this.api!.locate(postingOf(text));
+    if (located.length) this.show("fixes");
+    for (const { report, fix } of located) this.store.add({ report, fix, source: "posted" });
+    if (problems.length) throw new Error(problems.slice(0, 5).join("\n"));
   }
 
   private async simulateAt(position: Vec3): Promise<void> {

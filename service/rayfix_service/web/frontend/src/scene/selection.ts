@@ -69,7 +69,9 @@ export class Selection {
         }
         if (n > 0) {
           dots.push({ position: at, colour, diameter: 8 });
-          this.labels.push(stage.labels.add(percent(candidate.probability), "rival", at));
+          // Of measurements that contradict each other, probabilities say nothing.
+          const text = event.fix.status === "inconsistent" ? `rival ${n}` : percent(candidate.probability);
+          this.labels.push(stage.labels.add(text, "rival", at));
         }
       });
       if (event.truth) {

@@ -1,8 +1,8 @@
-/** Stations: a dot with the identifier, and a cone that points along the station's x axis. */
+/** Stations: a dot with the identifier, and a cone that opens along the station's boresight. */
 
 import { ConeGeometry, Group, Mesh, MeshBasicMaterial, Quaternion, Vector3 } from "three";
 
-import { localToScene, vec } from "../numeric";
+import { DEG, direction, vec } from "../numeric";
 import { theme } from "../theme";
 import type { StationInfo } from "../types";
 import { Dots } from "./shapes";
@@ -20,11 +20,11 @@ export class Stations {
   constructor(stage: Stage, stations: readonly StationInfo[], size: number) {
     this.places = stations.map((s) => stage.local(vec(s.position)));
     stations.forEach((station, n) => {
-      const turn = localToScene(station.orientation);
-      const axis = new Vector3(turn[0]![0], turn[1]![0], turn[2]![0]);
+      const { azimuth_deg, downtilt_deg } = station.boresight;
+      const axis = new Vector3(...direction(azimuth_deg * DEG, (90 + downtilt_deg) * DEG));
       const opening = Math.min(Math.max(station.field_of_view_deg / 8, NARROWEST), WIDEST);
       const cone = new ConeGeometry(size * Math.tan((opening * Math.PI) / 360), size, 24, 1, true);
-      // Its tip is at the station, its axis the station's.
+      // Its tip is at the station, its axis the boresight.
       cone.translate(0, -size / 2, 0);
       const mesh = new Mesh(cone, this.material);
       mesh.quaternion.copy(new Quaternion().setFromUnitVectors(new Vector3(0, -1, 0), axis));

@@ -42,7 +42,7 @@ export class Dialogs {
 
   /** Ask for a report; `locate` rejects with what is wrong with it. */
   paste(locate: (text: string) => Promise<void>): void {
-    const text = h("textarea", { rows: 14, spellcheck: false, placeholder: EXAMPLE, "aria-label": "Report as JSON" });
+    const text = h("textarea", { rows: 14, spellcheck: false, placeholder: EXAMPLE, "aria-label": "Report or message" });
     const problem = h("p", { className: "warning", role: "alert", hidden: true });
     const submit = h("button", { type: "submit", className: "primary" }, "Locate");
     const form = h(
@@ -62,7 +62,8 @@ export class Dialogs {
         },
       },
       h("h2", {}, "A report"),
-      h("p", { className: "muted" }, "Paste the JSON of a report, as POST /v1/positions takes it, or drop a file anywhere."),
+      h("p", { className: "muted" }, "Paste a report as POST /v1/positions takes it, a batch, an NRPPa message, angles of Silicon Labs locators or lines " +
+          "of u-blox anchors; or drop a file anywhere."),
       text,
       problem,
       h("div", { className: "actions" }, h("button", { type: "button", onclick: () => this.dialog.close() }, "Cancel"), submit),

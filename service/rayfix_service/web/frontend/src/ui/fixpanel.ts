@@ -4,7 +4,7 @@ import { bar, h, replace, swatch } from "../dom";
 import type { ExplainedFix, Residual } from "../residuals";
 import { percent } from "../scene/selection";
 import { hex, theme } from "../theme";
-import type { FixEvent, Point } from "../types";
+import type { Fix, FixEvent, Point } from "../types";
 
 const MEANING = {
   ok: "one place is likely",
@@ -16,6 +16,8 @@ const MEANING = {
 const SOURCES = { stream: "live", posted: "posted here", simulated: "simulated", file: "from the file" } as const;
 
 const KINDS: Record<string, string> = { aoa: "angle", pt: "range", toa: "arrival", tdoa: "difference", rssi: "strength" };
+
+const isTrusted = (fix: Fix): boolean => fix.status !== "inconsistent";
 
 export class FixPanel {
   readonly element = h("section", { className: "block fix" });
@@ -43,7 +45,8 @@ export class FixPanel {
       h("p", { className: "muted" }, [MEANING[fix.status], SOURCES[event.source]].join(" · ")),
       fix.timestamp !== null && h("p", { className: "muted number stamp" }, fix.timestamp),
       fix.position === null ? h("p", {}, "No position.") : this.position(event),
-      fix.candidates.length > 1 && this.rivals(event),
+      fix.warnings?.length ? h("ul", { className: "warnings" }, ...fix.warnings.map((text) => h("li", {}, text))) : null,
+      isTrusted(fix) && fix.candidates.length > 1 && this.rivals(event),
       this.measurements(explained),
     );
   }
@@ -66,9 +69,12 @@ export class FixPanel {
       h(
         "dl",
         { className: "facts" },
-        row("horizontal", `± ${fix.horizontal_accuracy_m!.toFixed(2)} m`, `with a probability of ${percent(fix.confidence)}`),
-        row("vertical", `± ${fix.vertical_accuracy_m!.toFixed(2)} m`, `with a probability of ${percent(fix.confidence)}`),
-        row("held with", percent(fix.confidence), "probability that the target is within the accuracies"),
+        // Probabilities hold for measurements that the model is of, which those of an inconsistent fix are not.
+        isTrusted(fix) &&
+          row("horizontal", `± ${fix.horizontal_accuracy_m!.toFixed(2)} m`, `with a probability of ${percent(fix.confidence)}`),
+        isTrusted(fix) &&
+          row("vertical", `± ${fix.vertical_accuracy_m!.toFixed(2)} m`, `with a probability of ${percent(fix.confidence)}`),
+        isTrusted(fix) && row("held with", percent(fix.confidence), "probability that the target is within the accuracies"),
         error === undefined ? row("computed in", `${fix.compute_ms.toFixed(1)} ms`) : row("true error", `${error.toFixed(2)} m`),
       ),
     );

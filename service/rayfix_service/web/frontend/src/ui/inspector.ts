@@ -30,7 +30,7 @@ export class Inspector {
     private readonly onError: (text: string) => void,
   ) {
     const first = site.stations[0]!;
-    this.aim = { stationId: first.id, azimuthDeg: Math.round(first.orientation.bearing_deg), zenithDeg: 97, stdevDeg: 1 };
+    this.aim = { stationId: first.id, azimuthDeg: Math.round(first.boresight.azimuth_deg), zenithDeg: 97, stdevDeg: 1 };
     this.stations = h("select", { id: "inspected", onchange: () => this.choose(this.stations.value) });
     for (const station of site.stations) this.stations.append(h("option", { value: station.id }, station.id));
     const slider = (key: keyof Inspector["sliders"], min: number, max: number, step: number): HTMLInputElement =>
