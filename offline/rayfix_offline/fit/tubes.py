@@ -140,6 +140,9 @@ def joint_to_tubes(
     spread, axes = np.linalg.eigh(x_cov)
     spread = np.maximum(spread, position_floor**2)
     x_cov = (axes * spread[:, None, :]) @ axes.transpose(0, 2, 1)
+    # Entries that would be zero are what rounding leaves of them, which differs from one LAPACK to the next.
+    quantum = position_floor**2 / 2**20
+    x_cov = np.round(x_cov / quantum) * quantum + 0.0
     return TubeMixture(
         log_weight=log_weight,
         u_mean=mean[:, :3],

@@ -16,7 +16,7 @@ from rayfix_tables.disk.schema import ARRAYS_VERSION
 from rayfix_tables.mounting import board_to_scene
 from rayfix_tables.site import Station
 
-BUILD_VERSION = 5
+BUILD_VERSION = 6
 """Raised with every change of the code that changes a table; numbers that do are part of the method."""
 
 BLOCK_CELLS = 256
