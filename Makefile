@@ -2,7 +2,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: mountings client coverage viewer viewer-test browser screenshots demo lock test test-kernels test-portable lint types package images accuracy openapi clean
+.PHONY: reference mountings client coverage viewer viewer-test browser screenshots demo lock test test-kernels test-portable \
+	lint types package images accuracy openapi clean
 
 # pip takes what builds the package from these too: under the first name until 25.2, under the second from 25.3 on.
 PINNED := PIP_CONSTRAINT=$(CURDIR)/constraints.txt PIP_BUILD_CONSTRAINT=$(CURDIR)/constraints.txt
@@ -36,6 +37,10 @@ viewer-test:
 	else \
 		echo "the viewer's own tests are left out: they need npm and Node.js 20.19 or later"; \
 	fi
+
+# The documentation's pages of the site file and of the command line, from the code.
+reference: $(VENV)/.done
+	$(BIN)/python tools/generate_reference.py
 
 # The documentation's drawings of how arrays are mounted.
 mountings: $(VENV)/.done
@@ -78,6 +83,7 @@ lint: $(VENV)/.done
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/python tools/generate_client.py --check
+	$(BIN)/python tools/generate_reference.py --check
 
 # The blocking client, from the asynchronous one.
 client: $(VENV)/.done

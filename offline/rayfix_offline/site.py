@@ -36,11 +36,24 @@ class _Section(BaseModel):
 class SiteSection(_Section):
     """``[site]``: the scene and how to read it."""
 
-    name: Annotated[str, Field(min_length=1, max_length=100)]
-    scene: Annotated[str, Field(min_length=1)]
-    scene_unit: Literal["m", "cm", "mm", "in", "ft"] = "m"
-    scene_up: Literal["z", "y"] = "z"
-    north_deg: Annotated[float, Field(ge=-360, le=360)] = 90.0
+    name: Annotated[str, Field(min_length=1, max_length=100)] = Field(
+        description="name of the site, which answers carry as source"
+    )
+    scene: Annotated[str, Field(min_length=1)] = Field(
+        description="scene file, relative to the site file: glb, gltf, obj, ply, stl, dae, Mitsuba XML or IFC",
+        json_schema_extra={"effect": "time and size grow with the clutter: see Large sites"},
+    )
+    scene_unit: Literal["m", "cm", "mm", "in", "ft"] = Field(
+        default="m", description="unit of the scene file, where the file does not say"
+    )
+    scene_up: Literal["z", "y"] = Field(
+        default="z", description="axis of the scene file that points up; glTF and IFC say it themselves"
+    )
+    north_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
+        default=90.0,
+        description="azimuth of geographic north in the scene frame, for angles of the frame north and bearings",
+        json_schema_extra={"effect": "nothing is built again"},
+    )
 
     @field_validator("scene")
     @classmethod
@@ -53,21 +66,61 @@ class SiteSection(_Section):
 class PropagationSection(_Section):
     """``[propagation]``: the paths, and which of them a station reports."""
 
-    carrier_ghz: Annotated[float, Field(gt=0, le=1000)] = 3.5
-    max_reflections: Annotated[int, Field(ge=0, le=8)] = 3
-    max_path_length_m: Annotated[float, Field(gt=0, le=10_000)] = 60.0
-    reflection: Literal["constant", "itu"] = "constant"
-    reflection_loss_db: Annotated[float, Field(ge=0, le=100)] = 6.0
-    path_prior: Literal["power", "uniform", "paper"] = "power"
-    path_prior_exponent: Annotated[float, Field(ge=0, le=20)] = 2.0
+    carrier_ghz: Annotated[float, Field(gt=0, le=1000)] = Field(
+        default=3.5,
+        description="carrier frequency, for the materials of reflection = itu",
+        json_schema_extra={"effect": "none"},
+    )
+    max_reflections: Annotated[int, Field(ge=0, le=8)] = Field(
+        default=3,
+        description="reflections that a path may have",
+        json_schema_extra={"effect": "time and size grow with each"},
+    )
+    max_path_length_m: Annotated[float, Field(gt=0, le=10_000)] = Field(
+        default=60.0,
+        description="longest path; at least the diagonal of the hall",
+        json_schema_extra={"effect": "time and size grow with it, as long as rays get that far"},
+    )
+    reflection: Literal["constant", "itu"] = Field(
+        default="constant",
+        description="loss of a reflection: the same for each, or by ITU-R P.2040 from the names of the materials",
+        json_schema_extra={"effect": "none"},
+    )
+    reflection_loss_db: Annotated[float, Field(ge=0, le=100)] = Field(
+        default=6.0,
+        description="loss of each reflection; with itu, of materials without a known name",
+        json_schema_extra={"effect": "none"},
+    )
+    path_prior: Literal["power", "uniform", "paper"] = Field(
+        default="power",
+        description="which path a station reports: the strong ones rather, any, or as in the paper",
+        json_schema_extra={"effect": "only power is balanced, which takes some time at the end"},
+    )
+    path_prior_exponent: Annotated[float, Field(ge=0, le=20)] = Field(
+        default=2.0,
+        description="how much strong paths are preferred: their power to this exponent",
+        json_schema_extra={"effect": "none"},
+    )
 
 
 class TableSection(_Section):
     """``[table]``: windows and fit of the table."""
 
-    windows_deg: tuple[Annotated[float, Field(ge=0.1, le=30)], ...] = (1.25, 5.0, 15.0)
-    fit: Literal["tubes", "em"] = "tubes"
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    windows_deg: tuple[Annotated[float, Field(ge=0.1, le=30)], ...] = Field(
+        default=(1.25, 5.0, 15.0),
+        description="standard deviations of the windows of angles, each at least 1.5 times the one before",
+        json_schema_extra={"effect": "decides time and size: see below"},
+    )
+    fit: Literal["tubes", "em"] = Field(
+        default="tubes",
+        description="how a cell is fitted: ray tubes, or the expectation-maximisation of the paper",
+        json_schema_extra={"effect": "em takes several hundred times as long"},
+    )
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(
+        default=1,
+        description="seed of the random offsets of the rays",
+        json_schema_extra={"effect": "none"},
+    )
 
     @model_validator(mode="after")
     def _windows_ascend(self) -> "TableSection":
@@ -84,25 +137,69 @@ class TableSection(_Section):
 class BiasSection(_Section):
     """``[stations.bias]``: systematic errors of a station, measured minus true."""
 
-    range_m: Annotated[float, Field(ge=-10_000, le=10_000)] = 0.0
-    range_stdev_m: Annotated[float, Field(ge=0, le=10_000)] = 0.0
-    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    zenith_deg: Annotated[float, Field(ge=-90, le=90)] = 0.0
-    angle_stdev_deg: Annotated[float, Field(ge=0, le=90)] = 0.0
+    range_m: Annotated[float, Field(ge=-10_000, le=10_000)] = Field(
+        default=0.0, description="of times as lengths, measured minus true"
+    )
+    range_stdev_m: Annotated[float, Field(ge=0, le=10_000)] = Field(
+        default=0.0, description="how uncertain that is: a standard deviation"
+    )
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
+        default=0.0, description="of azimuths, in the frame in which the station reports them"
+    )
+    zenith_deg: Annotated[float, Field(ge=-90, le=90)] = Field(default=0.0, description="of zenith angles, likewise")
+    angle_stdev_deg: Annotated[float, Field(ge=0, le=90)] = Field(
+        default=0.0, description="how uncertain either of these two is: a standard deviation"
+    )
 
 
 class StationSection(_Section):
     """``[[stations]]``: one base station, anchor or locator."""
 
-    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}$")]
-    position_m: tuple[Coordinate, Coordinate, Coordinate]
-    mounting: Mounting = "3gpp"
-    boresight_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
-    boresight_downtilt_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
-    roll_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
-    orientation_deg: Triple | None = None
-    field_of_view_deg: Annotated[float, Field(gt=0, le=360)] = 360.0
-    bias: BiasSection = BiasSection()
+    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}$")] = Field(
+        description="name that reports use: 1 to 64 letters, digits or . _ : -",
+        json_schema_extra={"effect": "built again under another name"},
+    )
+    position_m: tuple[Coordinate, Coordinate, Coordinate] = Field(
+        description="position of the antenna in the scene frame: x, y, z",
+        json_schema_extra={"effect": "the station is built again"},
+    )
+    mounting: Mounting = Field(
+        default="3gpp",
+        description="local frame of the array: which of its axes are the boresight and the upper edge",
+        json_schema_extra={"effect": "as of the boresight"},
+    )
+    boresight_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None = Field(
+        default=None,
+        description="where the array looks, counter-clockwise from +x of the scene; 0 unless given",
+        json_schema_extra={
+            "effect": "with a field of view of 360 deg nothing is built again, else what comes into view"
+        },
+    )
+    boresight_downtilt_deg: Annotated[float, Field(ge=-90, le=90)] | None = Field(
+        default=None,
+        description="how far it looks below the horizon; 0 unless given",
+        json_schema_extra={"effect": "likewise"},
+    )
+    roll_deg: Annotated[float, Field(ge=-360, le=360)] | None = Field(
+        default=None,
+        description="turn about the boresight, clockwise for who looks along it; 0 unless given",
+        json_schema_extra={"effect": "nothing is built again"},
+    )
+    orientation_deg: Triple | None = Field(
+        default=None,
+        description="instead of these three: bearing, downtilt and slant of TR 38.901",
+        json_schema_extra={"effect": "likewise"},
+    )
+    field_of_view_deg: Annotated[float, Field(gt=0, le=360)] = Field(
+        default=360.0,
+        description="full opening angle of the cone around the boresight in which the station measures",
+        json_schema_extra={"effect": "time and size are those of the cells within it"},
+    )
+    bias: BiasSection = Field(
+        default=BiasSection(),
+        description="what the station measures wrongly each time: a table of the keys below",
+        json_schema_extra={"effect": "nothing is built again"},
+    )
 
     @model_validator(mode="after")
     def _turned_once(self) -> "StationSection":

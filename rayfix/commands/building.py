@@ -13,11 +13,11 @@ from rayfix.extras import needs_extra
 def add_commands(add: AddCommand) -> None:
     """Add the commands to the command line."""
     check = add("check", _check, "list the problems of a site and its scene, each with its remedy")
-    check.add_argument("site", type=Path, metavar="SITE.toml")
+    check.add_argument("site", type=Path, metavar="SITE.toml", help="site file")
     check.add_argument("--json", action="store_true", help="as JSON")
 
     build = add("build", _build, "build the table of a site")
-    build.add_argument("site", type=Path, metavar="SITE.toml")
+    build.add_argument("site", type=Path, metavar="SITE.toml", help="site file")
     build.add_argument("-o", "--output", type=Path, required=True, metavar="T.h5", help="where the table goes")
     add_jobs_argument(build, "cells fitted at a time")
     build.add_argument("--cluster", metavar="ADDRESS", help="let the workers of this Dask scheduler fit the cells")
@@ -34,11 +34,11 @@ def add_commands(add: AddCommand) -> None:
     build.add_argument("--json", action="store_true", help="print the summary as JSON")
 
     info = add("info", _info, "show what a table holds")
-    info.add_argument("table", type=Path, metavar="T.h5")
+    info.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
     info.add_argument("--json", action="store_true", help="as JSON")
 
     verify = add("verify", _verify, "read a whole table and compare its checksums")
-    verify.add_argument("table", type=Path, metavar="T.h5")
+    verify.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
 
 
 def _check(options: argparse.Namespace) -> int:

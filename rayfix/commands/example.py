@@ -15,7 +15,7 @@ def add_commands(add: AddCommand) -> None:
     add_jobs_argument(demo, "cells fitted at a time")
 
     example = add("example", _example, "write the bundled hall: hall.glb, site.toml, report.json")
-    example.add_argument("folder", type=Path, metavar="DIR")
+    example.add_argument("folder", type=Path, metavar="DIR", help="folder, made if need be")
 
 
 def _demo(options: argparse.Namespace) -> int:

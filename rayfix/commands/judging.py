@@ -17,7 +17,7 @@ from rayfix.extras import needs_extra
 def add_commands(add: AddCommand) -> None:
     """Add the commands to the command line."""
     plan = add("plan", _plan, "forecast errors and coverage over the floor of a table and draw the map")
-    plan.add_argument("table", type=Path, metavar="T.h5")
+    plan.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
     plan.add_argument("-o", "--output", type=Path, required=True, metavar="MAP.png", help="picture: .png, .svg or .pdf")
     plan.add_argument("--height", type=float, required=True, metavar="Z", help="of the targets in the scene, m")
     plan.add_argument("--azimuth-stdev-deg", type=float, default=1.0, metavar="DEG", help="(default: 1)")
@@ -35,7 +35,7 @@ def add_commands(add: AddCommand) -> None:
     plan.add_argument("--json", action="store_true", help="print the map as JSON, one line for each table")
 
     evaluate = add("evaluate", _evaluate, "measure how well a site can be located in, and write a report")
-    evaluate.add_argument("site", type=Path, metavar="SITE.toml")
+    evaluate.add_argument("site", type=Path, metavar="SITE.toml", help="site file")
     evaluate.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the report")
     evaluate.add_argument("--table", type=Path, metavar="T.h5", help="the site's table (default: it is built)")
     evaluate.add_argument("--quick", action="store_true", help="few drops: some minutes instead of half an hour")

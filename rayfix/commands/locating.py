@@ -21,15 +21,15 @@ _PASSWORD_VARIABLE = "RAYFIX_MQTT_PASSWORD"  # not an argument, which other user
 def add_commands(add: AddCommand) -> None:
     """Add the commands to the command line."""
     locate = add("locate", _locate, "locate the reports of a file")
-    locate.add_argument("table", type=Path, metavar="T.h5")
-    locate.add_argument("report", type=Path, metavar="REPORT.json")
+    locate.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
+    locate.add_argument("report", type=Path, metavar="REPORT.json", help="file of the measurements")
     locate.add_argument("--format", choices=_INPUTS, default="native", help="format of the report (default: native)")
     add_output_arguments(locate)
     add_confidence_argument(locate)
     locate.add_argument("--json", action="store_true", help="the answer of the HTTP interface")
 
     mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: angles of Silicon Labs locators in, positions out")
-    mqtt.add_argument("table", type=Path, metavar="T.h5")
+    mqtt.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
     mqtt.add_argument("--broker", default="localhost", metavar="HOST[:PORT]", help="(default: localhost)")
     mqtt.add_argument(
         "--topic",

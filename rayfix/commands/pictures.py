@@ -12,13 +12,13 @@ _LAYERS = ("rays", "points", "mixture", "posterior", "fix")
 def add_commands(add: AddCommand) -> None:
     """Add the commands to the command line."""
     view = add("view", _view, "write the viewer with a site and the fixes of a file into one HTML page")
-    view.add_argument("table", type=Path, metavar="T.h5")
+    view.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
     view.add_argument("report", type=Path, nargs="?", metavar="REPORT.json", help="a report, or {'reports': [...]}")
     view.add_argument("-o", "--output", type=Path, required=True, metavar="FIX.html", help="the page")
 
     plot = add("plot", _plot, "draw a report in its scene: rays, points, mixtures, posterior and fix")
-    plot.add_argument("table", type=Path, metavar="T.h5")
-    plot.add_argument("report", type=Path, metavar="REPORT.json")
+    plot.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
+    plot.add_argument("report", type=Path, metavar="REPORT.json", help="file of the measurements")
     plot.add_argument("-o", "--output", type=Path, required=True, metavar="FIX.png", help=".png, .svg or .pdf")
     plot.add_argument(
         "--layers",

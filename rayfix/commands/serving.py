@@ -19,7 +19,7 @@ from rayfix.extras import needs_extra
 def add_commands(add: AddCommand) -> None:
     """Add the commands to the command line."""
     serve = add("serve", _serve, "serve a table, or all tables of a folder, over HTTP")
-    serve.add_argument("tables", type=Path, metavar="T.h5|DIR")
+    serve.add_argument("tables", type=Path, metavar="T.h5|DIR", help="table, or folder of tables *.h5")
     serve.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     serve.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
     serve.add_argument("--workers", type=int, default=1, help="processes that answer (default: 1)")
@@ -60,7 +60,6 @@ def add_commands(add: AddCommand) -> None:
     serve.add_argument(
         "--root-path",
         type=web_prefix,
-        default="",
         metavar="PATH",
         help="path below which a proxy offers the service, e.g. /rayfix; the proxy may take it off or not",
     )
@@ -132,7 +131,7 @@ def _serve(options: argparse.Namespace) -> int:
             reports_per_second=options.rate_limit,
             cors_origins=tuple(options.cors_origin),
             hosts=tuple(options.allowed_host),
-            root_path=options.root_path,
+            root_path=options.root_path or "",
             trust_forwarded_prefix=options.trust_forwarded_prefix,
             connection_limits=ConnectionLimits(
                 connections=options.connections,

@@ -17,6 +17,7 @@ from rayfix.example.drop import EXAMPLE_POSITION, example_paths, report_text, si
 from rayfix.example.hall import hall_scene, hall_stations
 from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_service.http.access.keys import add_key
+from rayfix_service.http.openapi.examples import UBLOX_EXAMPLES
 from tests.support.server_process import start_rayfix_serve
 
 expect = pytest.importorskip("playwright.sync_api", reason="playwright is not installed").expect
@@ -154,11 +155,34 @@ def test_a_report_is_pasted_and_refused_in_words(
     page.keyboard.press("v")
     page.fill("textarea", "{not json")
     page.get_by_role("button", name="Locate", exact=True).click()
-    page.wait_for_selector("dialog .warning:has-text('This is not JSON')")
+    page.wait_for_selector("dialog .warning:has-text('neither JSON nor')")
     page.screenshot(path=artefacts / "paste.png")
     page.fill("textarea", json.dumps({**report, "target_id": "pasted"}))
     page.get_by_role("button", name="Locate", exact=True).click()
     page.wait_for_selector("h2:has-text('pasted')")
+
+
+def test_a_message_is_pasted_and_an_inconsistent_fix_has_no_probabilities(open_page: OpenPage, hall_url: str):
+    page = open_page(hall_url)
+    page.keyboard.press("v")
+    page.fill("textarea", UBLOX_EXAMPLES["three_anchors"]["value"])
+    page.get_by_role("button", name="Locate", exact=True).click()
+    page.wait_for_selector("h2:has-text('6C1DEBA5F60C')")
+    assert "held with" in page.locator(".fix").inner_text()
+    seen = {"bs1": (-10.5, 96.5, 7.97), "bs2": (63.0, 102.7, 4.1), "bs3": (-133.7, 93.7, 13.96)}
+    measurements: list[dict[str, Any]] = []
+    for name, (azimuth, zenith, length) in seen.items():
+        angles = {"azimuth_deg": azimuth, "zenith_deg": zenith, "azimuth_stdev_deg": 1.0, "zenith_stdev_deg": 1.0}
+        measurements.append({"type": "aoa", "station_id": name, **angles})
+        measurements.append({"type": "pt", "station_id": name, "range_m": length, "stdev_m": 0.5})
+    page.keyboard.press("v")
+    page.fill("textarea", json.dumps({"target_id": "turned", "measurements": measurements}))
+    page.get_by_role("button", name="Locate", exact=True).click()
+    page.wait_for_selector("h2:has-text('turned')")
+    shown = page.locator(".fix").inner_text()
+    assert "the angles of all stations by +40" in shown
+    assert "held with" not in shown
+    assert "Where it may be" not in shown
 
 
 def test_a_click_simulates_a_report(open_page: OpenPage, hall_url: str, artefacts: Path):

@@ -202,6 +202,10 @@ def test_build_writes_a_table_and_a_summary(capsys: pytest.CaptureFixture[str], 
         (["build", "{site}", "-o", "{tmp}/no/such/t.h5"], r"there is no folder .*no/such; create it first"),
         (["build", "{site}", "-o", "{tmp}/t.h5", "--jobs", "0"], r"--jobs: '0' is not a number of jobs"),
         (["build", "{site}", "-o", "{tmp}/t.h5", "--jobs", "many"], r"--jobs: 'many' is not a number of jobs; give 1"),
+        (
+            ["serve", "{table}", "--root-path", "/a/../b"],
+            r"'/a/\.\./b' is no path of plain segments; give e.g\. /rayfix",
+        ),
         (["locate", "{table}", "{tmp}/none.json"], r"none\.json cannot be read"),
         (["locate", "{table}", "{site}", "--station", "A=bs1"], r"--station is for other systems' messages"),
         (

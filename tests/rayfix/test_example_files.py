@@ -14,9 +14,9 @@ def test_the_site_file_has_the_stations_of_the_hall_which_look_diagonally_into_i
     assert [(s["id"], tuple(s["position_m"])) for s in site["stations"]] == hall_stations()
     for station in site["stations"]:
         x, y, _ = station["position_m"]
-        bearing, *rest = station["orientation_deg"]
+        bearing, *rest = station["boresight_azimuth_deg"], station["boresight_downtilt_deg"]
         assert bearing == {(True, True): 45, (False, True): 135, (False, False): -135, (True, False): -45}[x < 4, y < 9]
-        assert rest == [0, 0]
+        assert rest == [0]
     assert site["table"]["windows_deg"] == [1.25, 5, 15]
 
 
