@@ -3,7 +3,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 
 .PHONY: reference mountings client coverage viewer viewer-test browser screenshots demo lock test test-kernels test-portable \
-	lint types package images accuracy openapi clean
+	test-lowest test-lowest-quick test-newest lint types package images accuracy openapi clean
 
 # pip takes what builds the package from these too: under the first name until 25.2, under the second from 25.3 on.
 PINNED := PIP_CONSTRAINT=$(CURDIR)/constraints.txt PIP_BUILD_CONSTRAINT=$(CURDIR)/constraints.txt
@@ -60,6 +60,16 @@ test: $(VENV)/.done
 test-portable: $(VENV)/.done
 	$(BIN)/python tests/portable.py
 
+# With the lowest versions that pyproject.toml asks for, and with the newest of everything; each in an environment of its own.
+test-lowest:
+	$(PYTHON) tests/bounds.py lowest
+
+test-lowest-quick:
+	$(PYTHON) tests/bounds.py lowest --quick
+
+test-newest:
+	$(PYTHON) tests/bounds.py newest
+
 # What the quick tests run of the code; compiled kernels are seen by the tests of their twins alone, without the compiler.
 KERNEL_TESTS := tests/service/fusion/test_kernels.py tests/service/fusion/product tests/service/fusion/posterior \
 	tests/offline/fit tests/tables/gaussians
@@ -114,4 +124,4 @@ openapi: $(VENV)/.done
 	$(BIN)/python -m rayfix_service.server.openapi > docs/openapi.json
 
 clean:
-	rm -rf $(VENV) dist demo browser-artefacts $(dir $(VIEWER)) $(FRONTEND)/node_modules .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-lowest .venv-newest dist demo browser-artefacts $(dir $(VIEWER)) $(FRONTEND)/node_modules .pytest_cache .mypy_cache .ruff_cache
