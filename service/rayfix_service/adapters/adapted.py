@@ -8,7 +8,8 @@ from pydantic import ValidationError
 from rayfix_service.fusion.measurements.report import Angle, Height, Measurement, Report, TimeOfArrival
 from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportError
 from rayfix_service.wire.documents import HeightDocument
-from rayfix_service.wire.problems import MAX_PROBLEMS, Path, path_text
+from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits
+from rayfix_service.wire.problems import Path, path_text
 from rayfix_tables.errors import ReportError
 
 
@@ -53,6 +54,7 @@ def adapted_report(
     target_id: str | None,
     timestamp: str | None,
     height: Height | None = None,
+    limits: MessageLimits = USUAL_LIMITS,
 ) -> Adapted:
     """Put measurements and what was left out together.
 
@@ -66,7 +68,7 @@ def adapted_report(
     if not measurements:
         problems = tuple(
             FieldProblem(path=skip.path, message=f"{path_text(skip.path)} is not used: {skip.reason}")
-            for skip in skipped[:MAX_PROBLEMS]
+            for skip in skipped[: limits.listed_problems]
         )
         empty = FieldProblem(path=(), message="the message has no measurements; give at least one")
         raise InvalidReportError(problems or (empty,), len(skipped) - len(problems))

@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError
@@ -11,14 +12,8 @@ from pydantic_core import ErrorDetails
 from rayfix_service.wire import FieldProblem, InvalidReportError, WireModel, path_text, read_json
 from rayfix_service.wire.documents import HeightDocument
 from rayfix_service.wire.fields import MISFIT, Rfc3339, misfit
-from rayfix_service.wire.limits import has_more_values
+from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits, has_more_values
 from rayfix_service.wire.problems import Path, invalid_report, shown
-
-MAX_STATIONS = 1024
-"""Names that the map of stations of one message may have."""
-
-MAX_MESSAGE_VALUES = 50_000
-"""Values that the JSON text of a message may have, those that are not read counted."""
 
 _SHORT = 64 << 10
 """Bytes of a message that is validated without a look at how many values it has."""
@@ -66,6 +61,7 @@ def check(
     message: Mapping[str, Any] | bytes,
     *,
     what: str,
+    limits: MessageLimits = USUAL_LIMITS,
     check_counts: Callable[[Mapping[str, Any]], None] | None = None,
     unwrap: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
 ) -> M:
@@ -79,6 +75,7 @@ def check(
         The parsed message, or its JSON text.
     what : str
         What the message is called in errors about the whole of it.
+    limits : MessageLimits, optional
     check_counts : callable, optional
         Raises InvalidReportError when a message, which need not be valid, has too much of something.
     unwrap : callable, optional
@@ -91,20 +88,22 @@ def check(
     InvalidReportError
         For a message that does not fit.
     """
-    if isinstance(message, bytes) and len(message) > _SHORT and has_more_values(message, MAX_MESSAGE_VALUES):
-        raise too_much((), f"{what} has more than {MAX_MESSAGE_VALUES} values; leave out what is not read")
+    most = limits.message_values
+    if isinstance(message, bytes) and len(message) > min(_SHORT, most) and has_more_values(message, most):
+        raise too_much((), f"{what} has more than {most} values; leave out what is not read")
     data = read_json(message) if isinstance(message, bytes) else message
     if isinstance(data, Mapping):
         data = dict(unwrap(data) if unwrap is not None else data)
         stations = data.get("stations")
-        if isinstance(stations, Mapping) and len(stations) > MAX_STATIONS:
-            raise too_much(("stations",), f"stations has {len(stations)} names; give at most {MAX_STATIONS}")
+        if isinstance(stations, Mapping) and len(stations) > limits.stations:
+            raise too_much(("stations",), f"stations has {len(stations)} names; give at most {limits.stations}")
         if check_counts is not None:
             check_counts(data)
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise invalid_report(error, model, data, lambda detail: _problem(model, detail, what)) from None
+        problem_of = partial(_problem, model, what)
+        raise invalid_report(error, model, data, problem_of, limits.listed_problems) from None
 
 
 def too_much(path: Path, text: str) -> InvalidReportError:
@@ -131,7 +130,7 @@ def one_of(model: WireModel) -> tuple[str, Any]:
     raise misfit(None, f"holds {found}; give exactly one of {names}")
 
 
-def _problem(root: type[WireModel], error: ErrorDetails, what: str) -> FieldProblem:
+def _problem(root: type[WireModel], what: str, error: ErrorDetails) -> FieldProblem:
     path, kind, value = error["loc"], error["type"], error["input"]
     owner, field = _look_up(root, path)
     if kind == MISFIT:

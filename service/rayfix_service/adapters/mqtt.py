@@ -17,7 +17,7 @@ import aiomqtt
 from rayfix_service.adapters.adapted import Adapted
 from rayfix_service.adapters.formats import OutputFormat, write
 from rayfix_service.adapters.omlox_hub import HubSettings, OmloxHub, open_hub
-from rayfix_service.adapters.silabs_stream import SilabsStream
+from rayfix_service.adapters.silabs_stream import PAYLOAD_BYTES, SilabsStream
 from rayfix_service.fusion.locator import Locator
 from rayfix_service.fusion.measurements.report import Frame, Height
 from rayfix_service.tracking.tracker import Tracker
@@ -70,6 +70,8 @@ class MqttSettings:
         Whether tags are followed from packet to packet.
     hub : HubSettings or None
         Omlox hub that is told of all positions as well.
+    payload_bytes : int
+        Longest message that is read.
     """
 
     topic: str = "silabs/aoa/angle/+/+"
@@ -81,6 +83,7 @@ class MqttSettings:
     height: Height | None = None
     track: bool = False
     hub: HubSettings | None = None
+    payload_bytes: int = PAYLOAD_BYTES
 
 
 def parse_broker(text: str, *, tls: bool = False, username: str | None = None, password: str | None = None) -> Broker:
@@ -167,7 +170,12 @@ async def run_mqtt(
     check_settings(settings)
     site = locator.table.site
     stream = SilabsStream(
-        site, window=settings.window, stations=settings.stations, frame=settings.frame, height=settings.height
+        site,
+        window=settings.window,
+        stations=settings.stations,
+        frame=settings.frame,
+        height=settings.height,
+        payload_bytes=settings.payload_bytes,
     )
     tracker = Tracker(locator.table.scene) if settings.track else None
     async with open_hub(settings.hub) as hub:

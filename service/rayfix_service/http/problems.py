@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
 from rayfix_service.wire import FieldProblem, MalformedJsonError, more_problems, path_text, problems_of
-from rayfix_service.wire.problems import MAX_PROBLEMS
+from rayfix_service.wire.limits import USUAL_LIMITS
 from rayfix_tables.errors import ReportError
 
 MEDIA_TYPE = "application/problem+json"
@@ -87,7 +87,9 @@ class Problem(BaseModel):
     title: str = Field(description="the kind of problem in words", examples=[INVALID_REPORT.title])
     status: int = Field(description="the HTTP status", examples=[INVALID_REPORT.status])
     detail: str = Field(description="what is wrong this time, and what to do about it")
-    errors: list[ProblemField] = Field(description=f"the offending fields, at most {MAX_PROBLEMS}")
+    errors: list[ProblemField] = Field(
+        description=f"the offending fields, at most {USUAL_LIMITS.listed_problems} unless the service is set otherwise"
+    )
     more_errors: int = Field(
         default=0, description="how many offending fields are left out of errors; absent when none is"
     )
@@ -169,7 +171,7 @@ async def _answer_validation(request: Request, error: Exception) -> JSONResponse
         FieldProblem(path=tuple(e["loc"][1:]), message=f"{path_text(tuple(e['loc'][1:]))}: {e['msg']}")
         for e in error.errors()
     ]
-    listed = errors[:MAX_PROBLEMS]
+    listed = errors[: USUAL_LIMITS.listed_problems]
     return problem_response(problem_document(INVALID_PARAMETER, errors[0].message, listed, len(errors) - len(listed)))
 
 

@@ -18,6 +18,7 @@ from rayfix_service.wire import (
     path_text,
     read_json,
 )
+from rayfix_service.wire.limits import USUAL_LIMITS
 from rayfix_service.wire.points import Matrix
 
 
@@ -157,7 +158,8 @@ def parse_simulation(body: bytes) -> SimulationRequest:
             hint = f"; give {field.description}" if field is not None and field.description else ""
             name = path_text(detail["loc"]) or "the document"
             problems.append(FieldProblem(path=detail["loc"], message=f"{name}: {detail['msg']}{hint}"))
-        raise InvalidReportError(tuple(problems)) from None
+        most = USUAL_LIMITS.listed_problems
+        raise InvalidReportError(tuple(problems[:most]), max(len(problems) - most, 0)) from None
 
 
 def mixture_document(station_id: str, view: DirectionView, *, most_cells: int = 64) -> dict[str, Any]:

@@ -18,12 +18,9 @@ from pydantic_core import ErrorDetails
 
 from rayfix_service.wire.documents import HeightDocument, ReportDocument
 from rayfix_service.wire.fields import MISFIT, WireModel
-from rayfix_service.wire.limits import names_of, trimmed
+from rayfix_service.wire.limits import USUAL_LIMITS, names_of, trimmed
 from rayfix_service.wire.measurements import MEASUREMENT_DOCUMENTS
 from rayfix_tables.errors import ReportError
-
-MAX_PROBLEMS = 50
-"""Problems that an error lists; it counts the others. A megabyte of unknown keys must not become megabytes of text."""
 
 _MAX_SHOWN = 60  # characters of a value or a key that a message repeats
 
@@ -56,18 +53,17 @@ class InvalidReportError(ReportError):
     Parameters
     ----------
     problems : tuple of FieldProblem
-        At least one; the first gives the error its message and its ``path``. Those beyond ``MAX_PROBLEMS`` are counted
-        and left out.
+        At least one; the first gives the error its message and its ``path``.
     more : int
-        Problems that were found besides.
+        Problems that were found besides. A megabyte of unknown keys must not become megabytes of text.
     """
 
     def __init__(self, problems: tuple[FieldProblem, ...], more: int = 0) -> None:
         others = len(problems) - 1 + more
         text = f" (and {others} more)" if others else ""
         super().__init__(problems[0].message + text, path=problems[0].path)
-        self.problems = problems[:MAX_PROBLEMS]
-        self.more = more + len(problems) - len(self.problems)
+        self.problems = problems
+        self.more = more
 
     def __reduce__(self) -> tuple[type["InvalidReportError"], tuple[tuple[FieldProblem, ...], int]]:
         """Pickle what it is made from: processes of a batch hand errors to each other."""
@@ -91,7 +87,7 @@ def invalid_report(
     model: type[WireModel],
     document: object,
     problem_of: Callable[[ErrorDetails], FieldProblem],
-    most: int = MAX_PROBLEMS,
+    most: int,
 ) -> InvalidReportError:
     """Say in this project's words what pydantic found wrong with a document.
 
@@ -110,12 +106,13 @@ def invalid_report(
         Problems that the error lists at most, the first ones; the others are counted.
     """
     found = error.error_count()
-    if found > MAX_PROBLEMS:
+    looked_at = max(most, USUAL_LIMITS.listed_problems)
+    if found > looked_at:
         try:
-            model.model_validate(trimmed(document, names_of(model), MAX_PROBLEMS))
+            model.model_validate(trimmed(document, names_of(model), looked_at))
         except ValidationError as fewer:
             error = fewer
-    details = error.errors(include_url=False)[:MAX_PROBLEMS]
+    details = error.errors(include_url=False)[:looked_at]
     # A misspelt key comes with a missing one; the first message should be the one that says so.
     details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
     problems = tuple(problem_of(detail) for detail in details[:most])

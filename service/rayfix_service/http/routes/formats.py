@@ -23,7 +23,7 @@ from rayfix_service.http.openapi.responses import (
 )
 from rayfix_service.http.problems import MALFORMED_JSON, Problem
 from rayfix_service.http.routes.dependencies import AnswererDep, LinesBody, ReportBody, ResponseOptionsDep, TableDep
-from rayfix_service.http.routes.json_answer import JsonAnswer
+from rayfix_service.http.routes.json_answer import JsonAnswer, results_answer, write_json
 
 router = APIRouter(prefix="/v1/positions", tags=["formats"])
 
@@ -47,7 +47,7 @@ async def post_nrppa(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    incoming = foreign(await answerer.read(parse_nrppa, body))
+    incoming = foreign(await answerer.read(partial(parse_nrppa, limits=answerer.message_limits), body))
     return JsonAnswer(await answerer.answer(table, incoming, options), media_type=options.media_type)
 
 
@@ -62,7 +62,7 @@ async def post_silabs(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    incoming = foreign(await answerer.read(parse_silabs, body))
+    incoming = foreign(await answerer.read(partial(parse_silabs, limits=answerer.message_limits), body))
     return JsonAnswer(await answerer.answer(table, incoming, options), media_type=options.media_type)
 
 
@@ -89,11 +89,13 @@ async def post_ublox(
     height_stdev_m: Annotated[float | None, Query(description="its standard deviation, m")] = None,
 ) -> JsonAnswer:
     """Take ``+UUDF`` lines of u-blox anchors and join them by tag and sequence number."""
-    known, results = known_height(height_m, height_stdev_m), []
+    known = known_height(height_m, height_stdev_m)
+    results: list[bytes] = []
     messages = await answerer.read(partial(parse_ublox, stations=station_map(station)), body)
     charge_reports(request, len(messages))
     cooperation = Cooperation(request)
     for adapted in messages:
         await cooperation.let_others_run()
-        results.append(await answerer.answer_or_problem(table, partial(foreign, with_height(adapted, known)), options))
-    return JsonAnswer({"results": results})
+        make = partial(foreign, with_height(adapted, known))
+        results.append(write_json(await answerer.answer_or_problem(table, make, options)))
+    return results_answer(results)

@@ -1,6 +1,7 @@
 """Routes that locate."""
 
 import asyncio
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -24,17 +25,17 @@ from rayfix_service.http.routes.dependencies import (
     TableDep,
     read_body,
 )
-from rayfix_service.http.routes.json_answer import JsonAnswer, write_json
+from rayfix_service.http.routes.json_answer import JsonAnswer, results_answer, write_json
 from rayfix_service.http.services import services_in
 from rayfix_service.wire import BatchDocument, MalformedJsonError, ReportDocument
 from rayfix_service.wire.batches import split_batch
-from rayfix_service.wire.problems import MAX_PROBLEMS
 
 
 class BatchResult(BaseModel):
     """The answers to a batch, in the order of its reports.
 
-    All its problems together list some 50 fields; once they do, each further one lists its first and counts the others.
+    All its problems together list some 50 fields, or what the service is set to; once they do, each further one lists
+    its first and counts the others.
     """
 
     results: list[NativeOrOther | Problem] = Field(
@@ -57,7 +58,7 @@ async def post_position(
 ) -> JsonAnswer:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
     return JsonAnswer(
-        await answerer.answer(table, await answerer.read(native, body), options), media_type=options.media_type
+        await answerer.answer(table, await answerer.read_report(body), options), media_type=options.media_type
     )
 
 
@@ -72,7 +73,7 @@ async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple
     table = services.tables.named(None)
     body = await read_body(scope, receive, services.settings.body_limits.report)
     options = response_options_of(scope, services.settings)
-    incoming = await answerer.read(native, body)
+    incoming = await answerer.read_report(body)
     await asyncio.sleep(0)
     located = await answerer.locate(table, incoming, options)
     await asyncio.sleep(0)
@@ -90,14 +91,15 @@ async def post_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
-    texts = await answerer.read(split_batch, body)
+    limits = answerer.message_limits
+    texts = await answerer.read(partial(split_batch, limits=limits), body)
     charge_reports(request, len(texts))
     cooperation = Cooperation(request)
     reports: list[Incoming | dict[str, Any]] = []  # all, before the first is located: a batch is JSON or it is not
     listed = 0
     for number, text in enumerate(texts):
         await cooperation.let_others_run()
-        read = partial(native, most_problems=MAX_PROBLEMS if listed < MAX_PROBLEMS else 1)
+        read = partial(native, limits=limits if listed < limits.listed_problems else replace(limits, listed_problems=1))
         try:
             reports.append(await answerer.read(read, text))
         except MalformedJsonError as error:
@@ -106,14 +108,14 @@ async def post_batch(
             problem = problem_of(error)
             reports.append(problem)
             listed += len(problem["errors"])
-    results: list[dict[str, Any]] = []
+    results: list[bytes] = []
     for report in reports:  # not by locate_batch: other batches keep the other workers, one for each core, as busy
         if isinstance(report, Incoming):
             await cooperation.let_others_run()
-            results.append(await answerer.answer_or_problem(table, partial(_itself, report), options))
+            results.append(write_json(await answerer.answer_or_problem(table, partial(_itself, report), options)))
         else:
-            results.append(report)
-    return JsonAnswer({"results": results})
+            results.append(write_json(report))
+    return results_answer(results)
 
 
 def _itself(report: Incoming) -> Incoming:
