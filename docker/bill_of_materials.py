@@ -1,7 +1,7 @@
 """Bills of materials (CycloneDX, JSON) of the wheel and of the images.
 
-The wheel's is that of an environment with nothing but the wheel and all its extras, by cyclonedx-bom; the images' are made
-from the lock by which they install, in which each package stands with its version and hashes.
+The wheel's is that of an environment with nothing but the wheel and all its extras, by cyclonedx-bom; the images' are
+made from the lock by which they install, in which each package stands with its version and hashes.
 """
 
 import subprocess

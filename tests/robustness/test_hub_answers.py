@@ -126,7 +126,7 @@ def test_how_much_of_an_answer_is_read_is_a_setting():
         connections: list[int] = []
 
         async def answer(writer: asyncio.StreamWriter, seen: list[int] = connections) -> None:
-            seen.append(id(writer))
+            seen.append(writer.get_extra_info("peername")[1])
             writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: 50000\r\n\r\n" + b"x" * 50_000)
 
         outcomes, _, _ = told_by(lambda path: answer, ["a", "b"], answer_bytes=answer_bytes)
