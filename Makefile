@@ -3,7 +3,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 
 .PHONY: reference mountings client coverage viewer viewer-test browser screenshots demo lock test test-kernels test-portable \
-	test-lowest test-lowest-quick test-newest lint types package images accuracy openapi clean
+	test-lowest test-lowest-quick test-newest lint types package audit bom images accuracy openapi clean
 
 # pip takes what builds the package from these too: under the first name until 25.2, under the second from 25.3 on.
 PINNED := PIP_CONSTRAINT=$(CURDIR)/constraints.txt PIP_BUILD_CONSTRAINT=$(CURDIR)/constraints.txt
@@ -116,6 +116,23 @@ lock: $(VENV)/.done
 # The images, built and run without a container engine: as root, with buildah and debootstrap.
 images: $(VENV)/.done viewer
 	$(BIN)/python docker/test_images.py
+
+# Tools that ask for many packages of their own, in an environment of their own.
+TOOLS := $(VENV)/tools
+
+$(TOOLS)/.done: Makefile
+	$(PYTHON) -m venv $(TOOLS)
+	timeout 60 $(TOOLS)/bin/python -m pip install --quiet cyclonedx-bom==7.5.0 pip-audit==2.10.1
+	touch $@
+
+# Known vulnerabilities of what the images install; left out, with the reason, where the database cannot be reached.
+audit:
+	-@$(MAKE) --no-print-directory $(TOOLS)/.done
+	@tools/audit.sh $(TOOLS)/bin/python
+
+# Bills of materials (CycloneDX) of the wheel and the images, beside the wheel in dist/.
+bom: $(TOOLS)/.done
+	$(TOOLS)/bin/python docker/bill_of_materials.py dist
 
 accuracy: $(VENV)/.done
 	$(BIN)/python -m benchmarks.fusion.accuracy

@@ -152,6 +152,13 @@ def add_hub_argument(command: argparse.ArgumentParser) -> None:
         help="also tell this omlox hub of all positions, e.g. http://hub:8081/v2; "
         f"a token is taken from the environment variable {_HUB_VARIABLE}",
     )
+    command.add_argument(
+        "--hub-answer-kib",
+        type=at_least_one,
+        default=4,
+        metavar="N",
+        help="of the hub's answer that are read, KiB (default: 4)",
+    )
 
 
 def hub_settings(options: argparse.Namespace) -> "HubSettings | None":
@@ -160,4 +167,5 @@ def hub_settings(options: argparse.Namespace) -> "HubSettings | None":
 
     if options.omlox_hub is None:
         return None
-    return HubSettings(url=options.omlox_hub, token=os.environ.get(_HUB_VARIABLE))
+    token = os.environ.get(_HUB_VARIABLE)
+    return HubSettings(url=options.omlox_hub, token=token, answer_bytes=options.hub_answer_kib << 10)

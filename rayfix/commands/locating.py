@@ -10,6 +10,7 @@ from rayfix.commands.arguments import (
     add_confidence_argument,
     add_hub_argument,
     add_output_arguments,
+    at_least_one,
     hub_settings,
 )
 from rayfix.extras import needs_extra
@@ -51,6 +52,9 @@ def add_commands(add: AddCommand) -> None:
     mqtt.add_argument("--track", action="store_true", help="follow tags from packet to packet")
     add_hub_argument(mqtt)
     mqtt.add_argument("--tls", action="store_true", help="encrypt; the port is then 8883 unless given")
+    mqtt.add_argument(
+        "--payload-kib", type=at_least_one, default=64, metavar="N", help="longest message, KiB (default: 64)"
+    )
     mqtt.add_argument("--username", help=f"the password is taken from the environment variable {_PASSWORD_VARIABLE}")
 
 
@@ -101,6 +105,7 @@ def _mqtt(options: argparse.Namespace) -> int:
         confidence=options.confidence,
         track=options.track,
         hub=hub_settings(options),
+        payload_bytes=options.payload_kib << 10,
     )
     serve_mqtt(options.table, broker, settings)
     return 0

@@ -83,6 +83,7 @@ def add_commands(add: AddCommand) -> None:
         help="memory that the check of a table may take, besides three times its size (default: 256)",
     )
     _add_limit_arguments(serve)
+    _add_message_arguments(serve)
 
     api_key = add("api-key", _api_key, "make an API key, print it once, and add its hash to a key file")
     api_key.add_argument("name", metavar="NAME", help="whose it is")
@@ -113,10 +114,37 @@ def _add_limit_arguments(command: argparse.ArgumentParser) -> None:
         )
 
 
+_MESSAGES = (
+    ("report-values", 5000, "values of a report"),
+    ("message-values", 50_000, "values of a message of another format"),
+    ("message-results", 1024, "measurements of an NRPPa message"),
+    ("message-stations", 1024, "names in a message's map of stations"),
+    ("batch-rest-kib", 64, "of a batch beside its reports, KiB"),
+    ("listed-errors", 50, "offending fields that a problem lists"),
+    ("body-kib", 1024, "longest body of a request, KiB"),
+    ("batch-kib", 16384, "longest body of a batch, KiB"),
+)
+
+
+def _add_message_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the limits on messages; their defaults are those of the service's settings."""
+    limits = command.add_argument_group("limits on messages")
+    for name, default, text in _MESSAGES:
+        limits.add_argument(
+            f"--{name}", type=at_least_one, default=default, metavar="N", help=f"{text} (default: {default})"
+        )
+
+
 def _serve(options: argparse.Namespace) -> int:
     with needs_extra("service"):
-        from rayfix_service.http.settings import ConnectionLimits, FeedLimits, ServiceSettings
+        from rayfix_service.http.settings import (
+            BodyLimits,
+            ConnectionLimits,
+            FeedLimits,
+            ServiceSettings,
+        )
         from rayfix_service.server.server import is_loopback, serve
+        from rayfix_service.wire.limits import MessageLimits
     from rayfix_tables.checked import CheckLimits
 
     serve(
@@ -133,6 +161,15 @@ def _serve(options: argparse.Namespace) -> int:
             hosts=tuple(options.allowed_host),
             root_path=options.root_path or "",
             trust_forwarded_prefix=options.trust_forwarded_prefix,
+            body_limits=BodyLimits(report=options.body_kib << 10, batch=options.batch_kib << 10),
+            message_limits=MessageLimits(
+                report_values=options.report_values,
+                message_values=options.message_values,
+                results=options.message_results,
+                stations=options.message_stations,
+                batch_rest_bytes=options.batch_rest_kib << 10,
+                listed_problems=options.listed_errors,
+            ),
             connection_limits=ConnectionLimits(
                 connections=options.connections,
                 head_bytes=options.head_kib << 10,

@@ -15,6 +15,7 @@ import h5py
 import psutil
 import pytest
 
+from benchmarks.robustness.flips import flipped
 from rayfix_service.http.answering import served_tables, table_checks
 from rayfix_service.http.answering.served_tables import load_tables
 from rayfix_service.server.server import serve
@@ -25,7 +26,6 @@ from tests.support.checkout import ROOT
 from tests.support.hand_tables import line_of_sight, table_of
 from tests.support.running_app import RunningApp
 from tests.support.server_process import ServerProcess, start_server
-from tests.support.table_flips import flipped
 
 POLL = 0.05  # s
 HANGS = (2985, 3)  # a bit of the stored table with which HDF5 2.0 is busy for ever

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rayfix_service.adapters.mqtt import BrokerError, MqttSettings, check_settings, topic_for
-from rayfix_service.adapters.silabs_stream import MAX_PAYLOAD, SilabsStream
+from rayfix_service.adapters.silabs_stream import PAYLOAD_BYTES, SilabsStream
 from rayfix_service.locator import Locator
 from rayfix_service.wire.names import MAX_NAME, in_log, topic_level
 from rayfix_tables.site import SiteInfo, Station
@@ -144,8 +144,11 @@ def test_what_is_remembered_of_a_broker_is_limited():
     stream = SilabsStream(SITE, window=60.0)
     ended = sum(len(stream.receive(f"a/bs1/t{n}", payload(n), 0.0)) for n in range(21_000))
     assert ended == 1000
-    assert stream.receive("a/bs1/t", b" " * (MAX_PAYLOAD + 1), 0.0) == []
+    assert stream.receive("a/bs1/t", b" " * (PAYLOAD_BYTES + 1), 0.0) == []
     assert stream.num_passed_over == 1
+    short = SilabsStream(SITE, window=60.0, payload_bytes=20)
+    assert short.receive("a/bs1/t", payload(1), 0.0) == []
+    assert short.num_passed_over == 1
 
 
 def test_the_log_has_a_line_for_a_message_whatever_its_topic_holds(caplog: pytest.LogCaptureFixture):

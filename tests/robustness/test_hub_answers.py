@@ -120,6 +120,20 @@ def test_of_a_huge_answer_little_is_read():
     assert sent["bytes"] < 32_000_000  # what the buffers of the connection hold
 
 
+def test_how_much_of_an_answer_is_read_is_a_setting():
+    """One that is read to its end leaves the connection open for the next."""
+    for answer_bytes, closed in ((10, True), (100_000, False)):
+        connections: list[int] = []
+
+        async def answer(writer: asyncio.StreamWriter, seen: list[int] = connections) -> None:
+            seen.append(writer.get_extra_info("peername")[1])
+            writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: 50000\r\n\r\n" + b"x" * 50_000)
+
+        outcomes, _, _ = told_by(lambda path: answer, ["a", "b"], answer_bytes=answer_bytes)
+        assert outcomes == {"sent": 2}
+        assert (len(set(connections)) == 2) == closed
+
+
 @pytest.mark.parametrize(
     "target", ["a/../b", "a?b=c", "a#b", "a\r\nhost: b", "a\0b", "\\..\\", "%2e%2e", "a b", "ü;=&+"]
 )

@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from rayfix_service.http.openapi.examples import BATCH_EXAMPLES
-from rayfix_service.wire.problems import MAX_PROBLEMS
+from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits
 from tests.support.running_app import JSON, RunningApp
 
 TEXT = {"content-type": "text/plain"}
@@ -76,9 +76,9 @@ def test_the_event_loop_is_not_held(app: RunningApp, path: str, headers: dict[st
     document = answer.json()
     problems = document.get("results", [document])
     listed = [len(problem["errors"]) for problem in problems]
-    assert 0 < listed[0] <= MAX_PROBLEMS
-    assert sum(listed) < 2 * MAX_PROBLEMS + len(listed)
-    assert len(answer.content) < 1000 * (len(listed) + MAX_PROBLEMS)
+    assert 0 < listed[0] <= USUAL_LIMITS.listed_problems
+    assert sum(listed) < 2 * USUAL_LIMITS.listed_problems + len(listed)
+    assert len(answer.content) < 1000 * (len(listed) + USUAL_LIMITS.listed_problems)
 
 
 def test_a_batch_lists_errors_up_to_a_limit_and_counts_the_others(app: RunningApp):
@@ -103,3 +103,32 @@ def test_a_bad_report_leaves_the_others_of_its_batch_alone_and_bad_json_does_not
     assert answer.status_code == 400
     assert answer.json()["detail"].startswith("reports[1]: the document is not JSON")
     assert app.post_bytes("/v1/positions/batch", b'{"reports":[' + one + b",]}").status_code == 400
+
+
+def test_limits_of_messages_are_settings(hall_table_path: Path):
+    limits = MessageLimits(
+        report_values=400, message_values=300, results=4, stations=3, batch_rest_bytes=2000, listed_problems=2
+    )
+    refusals: list[tuple[str, Any, str]] = [
+        ("", {"measurements": [{"k": n} for n in range(300)]}, "more than 400 values"),
+        ("/silabs", {"angles": [{"locator_id": "a", "x": list(range(400))}]}, "more than 300 values"),
+        ("/silabs", {"stations": dict.fromkeys("abcd", "bs1")}, "give at most 3"),
+        ("/nrppa", {"TRP-MeasurementResponseList": [{"tRP-ID": 1, "measurementResult": [{}] * 5}]}, "more than 4 m"),
+        ("/batch", {"reports": [], "x": "y" * 3000}, "bytes after its reports"),
+    ]
+    with RunningApp(hall_table_path, message_limits=limits) as app:
+        for path, document, words in refusals:
+            answer = app.post(f"/v1/positions{path}", document)
+            assert answer.status_code == 422
+            assert words in answer.json()["detail"], answer.text
+        wrong = {"measurements": [{"type": "pt"}] * 4}
+        (one,) = {
+            app.post(path, wrong).text for path in ("/v1/positions", "/v1/positions?table=hall", "/v1/posteriors")
+        }
+        assert len(json.loads(one)["errors"]) == 2
+        assert json.loads(one)["more_errors"] > 0
+        listed = [
+            len(problem["errors"])
+            for problem in app.post("/v1/positions/batch", {"reports": [wrong] * 3}).json()["results"]
+        ]
+        assert listed == [2, 1, 1]

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from rayfix_service.adapters.formats import write
-from rayfix_service.adapters.nrppa import MAX_RESULTS, parse_nrppa
+from rayfix_service.adapters.nrppa import parse_nrppa
 from rayfix_service.adapters.silabs import parse_silabs
 from rayfix_service.adapters.silabs_stream import SilabsStream
 from rayfix_service.adapters.transmissions import Joiner
@@ -21,8 +21,7 @@ from rayfix_service.fusion.posterior.fix import Fix, Outcome
 from rayfix_service.http.routes.positions import split_batch
 from rayfix_service.locator import Locator
 from rayfix_service.wire import FieldProblem, InvalidReportError, fix_to_document, parse_report, problems_of
-from rayfix_service.wire.limits import has_more_values
-from rayfix_service.wire.problems import MAX_PROBLEMS
+from rayfix_service.wire.limits import USUAL_LIMITS, has_more_values
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table
@@ -276,7 +275,7 @@ def test_a_message_as_long_as_a_body_may_be_is_read_or_refused_at_once(read: Rea
     outcome = attempt(read, message)
     assert thread_time() - begin < 3.0
     if isinstance(outcome, ReportError):
-        assert len(problems_of(outcome)) <= MAX_PROBLEMS
+        assert len(problems_of(outcome)) <= USUAL_LIMITS.listed_problems
         assert len(str(outcome)) < 2000
 
 
@@ -285,8 +284,8 @@ def test_the_errors_of_a_report_are_listed_up_to_a_limit_and_counted():
     with pytest.raises(InvalidReportError) as refused:
         parse_report({"measurements": [aoa(zenith_deg=[])] * 100 + [aoa(**unknown(100))], "extra": 1})
     error = refused.value
-    assert len(error.problems) == MAX_PROBLEMS
-    assert error.more == 100 + 100 + 1 - MAX_PROBLEMS
+    assert len(error.problems) == USUAL_LIMITS.listed_problems
+    assert error.more == 100 + 100 + 1 - USUAL_LIMITS.listed_problems
     assert str(error).endswith("(and 200 more)")
     again = pickle.loads(pickle.dumps(error))
     assert (str(again), again.problems, again.more, again.path) == (str(error), error.problems, error.more, error.path)
@@ -296,14 +295,14 @@ def test_measurements_that_are_not_used_are_listed_up_to_a_limit_and_counted():
     """One answer listed 30,000 angles that no fix can use."""
     with pytest.raises(InvalidReportError, match=r"\(and 127 more\)") as refused:
         parse_nrppa(nrppa(*[NO_AZIMUTH] * 16))
-    assert len(refused.value.problems) == MAX_PROBLEMS
-    assert refused.value.more == 128 - MAX_PROBLEMS
+    assert len(refused.value.problems) == USUAL_LIMITS.listed_problems
+    assert refused.value.more == 128 - USUAL_LIMITS.listed_problems
 
 
 def test_counts_are_looked_at_first():
     """Limits were found exceeded after all else had been validated or converted."""
-    with pytest.raises(InvalidReportError, match=f"has more than {MAX_RESULTS} measurements; give at most"):
-        parse_nrppa(nrppa(*[{}] * (MAX_RESULTS + 1)))
+    with pytest.raises(InvalidReportError, match=f"has more than {USUAL_LIMITS.results} measurements; give at most"):
+        parse_nrppa(nrppa(*[{}] * (USUAL_LIMITS.results + 1)))
     with pytest.raises(InvalidReportError, match="stations has 1025 names; give at most 1024"):
         parse_silabs(dumped({"angles": [], "stations": unknown(1025)}))
     with pytest.raises(InvalidReportError, match="the report has more than 5000 values; give at most 256 measurements"):

@@ -14,9 +14,10 @@ import pytest
 
 from rayfix.cli import main
 from rayfix_service.http.access.keys import add_key
-from rayfix_service.http.settings import ConnectionLimits, FeedLimits, ServiceSettings
+from rayfix_service.http.settings import BodyLimits, ConnectionLimits, FeedLimits, ServiceSettings
 from rayfix_service.server import server as server_module
 from rayfix_service.server.server import fitting
+from rayfix_service.wire.limits import MessageLimits
 from tests.support.reports import REPORT
 from tests.support.server_process import ServerProcess, start_server
 
@@ -355,6 +356,17 @@ def test_the_command_has_the_limits_of_the_settings(
         idle_seconds=3.0,
         unread_seconds=4.0,
     )
+    messages = ["--report-values", "1", "--message-values", "2", "--message-results", "3", "--message-stations", "4"]
+    messages += ["--batch-rest-kib", "5", "--listed-errors", "6", "--body-kib", "7", "--batch-kib", "8"]
+    hub = ["--omlox-hub", "http://hub:8081/v2", "--hub-answer-kib", "9"]
+    assert main(["serve", "hall.h5", *messages, *hub]) == 0
+    assert (served[0].message_limits, served[0].body_limits) == (MessageLimits(), BodyLimits())
+    assert served[2].message_limits == MessageLimits(
+        report_values=1, message_values=2, results=3, stations=4, batch_rest_bytes=5 << 10, listed_problems=6
+    )
+    assert served[2].body_limits == BodyLimits(report=7 << 10, batch=8 << 10)
+    assert served[2].hub is not None
+    assert served[2].hub.answer_bytes == 9 << 10
     assert served[1].feed_limits == FeedLimits(listeners=5, backlog_bytes=6 << 10)
     assert served[1].hosts == ("maps.example.com",)
     for option, value in (("--connections", "0"), ("--head-seconds", "0"), ("--body-seconds", "x")):

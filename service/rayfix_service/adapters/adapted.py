@@ -15,7 +15,7 @@ from rayfix_service.fusion.measurements.report import (
 )
 from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportError
 from rayfix_service.wire.documents import HeightDocument
-from rayfix_service.wire.problems import MAX_PROBLEMS
+from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits
 from rayfix_tables.errors import ReportError
 from rayfix_tables.problems import Path, path_text
 
@@ -62,6 +62,7 @@ def adapted_report(
     timestamp: str | None,
     height: Height | None = None,
     confidence: float = CONFIDENCE,
+    limits: MessageLimits = USUAL_LIMITS,
 ) -> Adapted:
     """Combine measurements and what was left out.
 
@@ -75,7 +76,7 @@ def adapted_report(
     if not measurements:
         problems = tuple(
             FieldProblem(path=skip.path, message=f"{path_text(skip.path)} is not used: {skip.reason}")
-            for skip in skipped[:MAX_PROBLEMS]
+            for skip in skipped[: limits.listed_problems]
         )
         empty = FieldProblem(path=(), message="the message has no measurements; give at least one")
         raise InvalidReportError(problems or (empty,), len(skipped) - len(problems))

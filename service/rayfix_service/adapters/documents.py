@@ -8,15 +8,9 @@ from pydantic import Field, ValidationError
 from rayfix_service.wire import FieldProblem, InvalidReportError, WireModel, read_json
 from rayfix_service.wire.documents import HeightDocument
 from rayfix_service.wire.fields import Rfc3339, misfit
-from rayfix_service.wire.limits import has_more_values
+from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits, has_more_values
 from rayfix_service.wire.problems import invalid_report
 from rayfix_tables.problems import Path
-
-MAX_STATIONS = 1024
-"""Names that the map of stations of one message may have."""
-
-MAX_MESSAGE_VALUES = 50_000
-"""Values that the JSON text of a message may have, those that are not read counted."""
 
 _SHORT = 64 << 10
 """Bytes of a message up to which its values are not counted before the validation."""
@@ -64,6 +58,7 @@ def check(
     message: Mapping[str, Any] | bytes,
     *,
     what: str,
+    limits: MessageLimits = USUAL_LIMITS,
     check_counts: Callable[[Mapping[str, Any]], None] | None = None,
     unwrap: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
 ) -> M:
@@ -77,6 +72,7 @@ def check(
         The parsed message, or its JSON text.
     what : str
         What the message is called in errors about the whole of it.
+    limits : MessageLimits, optional
     check_counts : callable, optional
         Raises InvalidReportError when a message, which need not be valid, has too much of something.
     unwrap : callable, optional
@@ -89,20 +85,21 @@ def check(
     InvalidReportError
         For a message that does not fit.
     """
-    if isinstance(message, bytes) and len(message) > _SHORT and has_more_values(message, MAX_MESSAGE_VALUES):
-        raise too_much((), f"{what} has more than {MAX_MESSAGE_VALUES} values; leave out what is not read")
+    most = limits.message_values
+    if isinstance(message, bytes) and len(message) > min(_SHORT, most) and has_more_values(message, most):
+        raise too_much((), f"{what} has more than {most} values; leave out what is not read")
     data = read_json(message) if isinstance(message, bytes) else message
     if isinstance(data, Mapping):
         data = dict(unwrap(data) if unwrap is not None else data)
         stations = data.get("stations")
-        if isinstance(stations, Mapping) and len(stations) > MAX_STATIONS:
-            raise too_much(("stations",), f"stations has {len(stations)} names; give at most {MAX_STATIONS}")
+        if isinstance(stations, Mapping) and len(stations) > limits.stations:
+            raise too_much(("stations",), f"stations has {len(stations)} names; give at most {limits.stations}")
         if check_counts is not None:
             check_counts(data)
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise invalid_report(error, model, data, what) from None
+        raise invalid_report(error, model, data, what, limits.listed_problems) from None
 
 
 def too_much(path: Path, text: str) -> InvalidReportError:

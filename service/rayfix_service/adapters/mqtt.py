@@ -17,7 +17,7 @@ import aiomqtt
 from rayfix_service.adapters.adapted import Adapted, with_confidence
 from rayfix_service.adapters.formats import OutputFormat, write
 from rayfix_service.adapters.omlox_hub import HubSettings, OmloxHub, open_hub
-from rayfix_service.adapters.silabs_stream import SilabsStream
+from rayfix_service.adapters.silabs_stream import PAYLOAD_BYTES, SilabsStream
 from rayfix_service.fusion.measurements.report import Frame, Height
 from rayfix_service.locator import Locator
 from rayfix_service.tracking.tracker import Tracker
@@ -72,6 +72,8 @@ class MqttSettings:
         Whether tags are followed from packet to packet.
     hub : HubSettings or None
         Omlox hub that all positions are sent to as well.
+    payload_bytes : int
+        Longest message that is read.
     """
 
     topic: str = "silabs/aoa/angle/+/+"
@@ -84,6 +86,7 @@ class MqttSettings:
     confidence: float | None = None
     track: bool = False
     hub: HubSettings | None = None
+    payload_bytes: int = PAYLOAD_BYTES
 
 
 def parse_broker(text: str, *, tls: bool = False, username: str | None = None, password: str | None = None) -> Broker:
@@ -170,7 +173,12 @@ async def run_mqtt(
     check_settings(settings)
     site = locator.table.site
     stream = SilabsStream(
-        site, window=settings.window, stations=settings.stations, frame=settings.frame, height=settings.height
+        site,
+        window=settings.window,
+        stations=settings.stations,
+        frame=settings.frame,
+        height=settings.height,
+        payload_bytes=settings.payload_bytes,
     )
     tracker = Tracker(locator.table) if settings.track else None
     async with open_hub(settings.hub) as hub:

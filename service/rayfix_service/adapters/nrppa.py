@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from rayfix_service.adapters.nrppa_documents import (
 from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_interval, time_interval
 from rayfix_service.fusion.measurements.directions import to_scene
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, TimeOfArrival
+from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits
 from rayfix_tables.angles import wrap_one
 from rayfix_tables.problems import Path, path_text
 from rayfix_tables.site import Station
@@ -44,14 +46,15 @@ _ALONE = "a gNB's Rx-Tx time difference is a range only together with the UE's; 
 _POWER = "powers and phases are not used"
 _MORE_PATHS = "times of additional paths are not used; angles of several paths are, as MultipleULAoA"
 
-
-MAX_RESULTS = 1024
-"""Measurements that one message may have, all TRPs together, each angle of a MultipleULAoA counted."""
-
 _LISTS = ("TRP-MeasurementResponseList", "TRP-MeasurementReportList")
 
 
-def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, str] | None = None) -> Adapted:
+def parse_nrppa(
+    message: Mapping[str, Any] | bytes,
+    *,
+    stations: Mapping[str, str] | None = None,
+    limits: MessageLimits = USUAL_LIMITS,
+) -> Adapted:
     """Turn an NRPPa measurement message into a report.
 
     UL-AoA becomes an angle in the frame "north", since azimuths of the global coordinate system count from
@@ -67,6 +70,7 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
     stations : Mapping, optional
         Stations by TRP-ID (as text), for those that the message's own map does not have. A TRP-ID in neither is
         itself a station's identifier.
+    limits : MessageLimits, optional
 
     Raises
     ------
@@ -75,7 +79,14 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
     InvalidReportError
         For a message that is not valid, or of which no measurement can be used.
     """
-    document = check(NrppaDocument, message, what="the NRPPa message", check_counts=_check_counts, unwrap=unwrapped)
+    document = check(
+        NrppaDocument,
+        message,
+        what="the NRPPa message",
+        limits=limits,
+        check_counts=partial(_check_counts, limits.results),
+        unwrap=unwrapped,
+    )
     name = _LISTS[0] if document.response else _LISTS[1]
     ranges_to: dict[int, list[UeRxTx]] = {}
     for ue in document.ue_rx_tx:
@@ -95,10 +106,9 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
                     skipped.append(Skipped(path=(*path, *place), reason=outcome))
                 else:
                     measurements.append(((*path, *place), _with_line_of_sight(outcome, item.los)))
-            if len(measurements) + len(skipped) > 2 * MAX_RESULTS:  # each may be one range for every ue_rx_tx
-                text = (
-                    f"ue_rx_tx makes more than {2 * MAX_RESULTS} measurements of the message's; give one for each TRP"
-                )
+            if len(measurements) + len(skipped) > 2 * limits.results:  # each may be one range for every ue_rx_tx
+                most = 2 * limits.results
+                text = f"ue_rx_tx makes more than {most} measurements of the message's; give one for each TRP"
                 raise too_much(("ue_rx_tx",), text)
     return adapted_report(
         measurements,
@@ -107,10 +117,11 @@ def parse_nrppa(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, st
         timestamp=document.timestamp,
         height=None if document.height is None else document.height.height(),
         confidence=document.confidence,
+        limits=limits,
     )
 
 
-def _check_counts(message: Mapping[str, Any]) -> None:
+def _check_counts(most: int, message: Mapping[str, Any]) -> None:
     """Count the measurements of a message that need not be valid.
 
     Raises
@@ -126,10 +137,8 @@ def _check_counts(message: Mapping[str, Any]) -> None:
                 several = value.get("MultipleULAoA") if isinstance(value, Mapping) else None
                 angles = several.get("multipleULAoA") if isinstance(several, Mapping) else None
                 num_results += max(len(_array(angles)), 1)
-                if num_results > MAX_RESULTS:
-                    text = (
-                        f"{path_text((name,))} has more than {MAX_RESULTS} measurements; give at most as many at once"
-                    )
+                if num_results > most:
+                    text = f"{path_text((name,))} has more than {most} measurements; give at most as many at once"
                     raise too_much((name,), text)
 
 

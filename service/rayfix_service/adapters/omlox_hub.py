@@ -28,9 +28,6 @@ _log = logging.getLogger(__name__)
 HubOutcome = Literal["sent", "refused", "dropped"]
 """Outcome of a location: the hub accepted or refused it, or it was dropped since the queue or the time was used up."""
 
-MAX_ANSWER = 4096
-"""Bytes of a hub's answer that are read, for the sake of the connection; nothing of them is used."""
-
 _PASSING = frozenset({408, 425, 429, 500, 502, 503, 504})
 """Statuses of a hub that may take the same location later."""
 
@@ -59,6 +56,8 @@ class HubSettings:
         Before the second attempt, and at most; each is twice as long as that before.
     timeout : float, s
         From the beginning of an attempt to the end of the hub's answer, however the hub sends it.
+    answer_bytes : int
+        Of an answer that are read, for the sake of the connection; nothing of them is used.
     """
 
     url: str
@@ -69,6 +68,7 @@ class HubSettings:
     first_pause: float = 0.25
     longest_pause: float = 5.0
     timeout: float = 5.0
+    answer_bytes: int = 4096
 
     def __post_init__(self) -> None:
         """Refuse what is no address."""
@@ -185,7 +185,7 @@ class OmloxHub:
                 status, length = answer.status_code, 0
                 async for part in answer.aiter_raw():
                     length += len(part)
-                    if length > MAX_ANSWER:
+                    if length > self._settings.answer_bytes:
                         break
         except (TimeoutError, httpx.HTTPError):
             if status is None:

@@ -15,6 +15,7 @@ from rayfix_service.adapters.documents import KnownHeight, Stations, TargetId, T
 from rayfix_service.fusion.measurements.report import CONFIDENCE, Angle, Frame, Measurement, Range
 from rayfix_service.wire import MAX_MEASUREMENTS, MAX_REPORTS, WireModel
 from rayfix_service.wire.fields import Confidence, misfit
+from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits
 from rayfix_tables.angles import wrap_one
 from rayfix_tables.problems import Path
 
@@ -84,7 +85,12 @@ class SilabsBatchDocument(WireModel):
     )
 
 
-def parse_silabs(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, str] | None = None) -> Adapted:
+def parse_silabs(
+    message: Mapping[str, Any] | bytes,
+    *,
+    stations: Mapping[str, str] | None = None,
+    limits: MessageLimits = USUAL_LIMITS,
+) -> Adapted:
     """Turn the angles of one packet into a report.
 
     Parameters
@@ -94,6 +100,7 @@ def parse_silabs(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, s
     stations : Mapping, optional
         Stations by locator, for those that the message's own map does not have. A locator in neither is itself a
         station's identifier.
+    limits : MessageLimits, optional
 
     Raises
     ------
@@ -102,7 +109,7 @@ def parse_silabs(message: Mapping[str, Any] | bytes, *, stations: Mapping[str, s
     InvalidReportError
         For a message that is not valid.
     """
-    document = check(SilabsDocument, message, what="the message")
+    document = check(SilabsDocument, message, what="the message", limits=limits)
     measurements: list[tuple[Path, Measurement]] = []
     for n, angle in enumerate(document.angles):
         station_id = station_of(angle.locator_id, document.stations, stations)

@@ -14,8 +14,8 @@ from rayfix_tables.site import SiteInfo
 
 _log = logging.getLogger(__name__)
 
-MAX_PAYLOAD = 64 << 10
-"""Bytes of a message that is read; an angle has some hundred."""
+PAYLOAD_BYTES = 64 << 10
+"""Bytes that a message may have, where nothing else is set; an angle has some hundred."""
 
 _MOST_PACKETS = 20_000
 """Packets that wait for more locators, and that are remembered as ended; beyond that, the oldest end early."""
@@ -44,6 +44,8 @@ class SilabsStream:
         Least standard deviation to believe.
     height : Height, optional
         What is known of the height of all tags.
+    payload_bytes : int
+        Longest message that is read.
 
     Attributes
     ----------
@@ -60,6 +62,7 @@ class SilabsStream:
         frame: Frame = "lcs",
         least_stdev_deg: float = LEAST_STDEV_DEG,
         height: Height | None = None,
+        payload_bytes: int = PAYLOAD_BYTES,
     ) -> None:
         self._known = {station.id for station in site.stations}
         self._joiner: Joiner[tuple[datetime, SilabsAngle]] = Joiner(
@@ -69,6 +72,7 @@ class SilabsStream:
         self._frame: Frame = frame
         self._least_stdev_deg = least_stdev_deg
         self._height = height
+        self._payload_bytes = payload_bytes
         self._told: set[str] = set()
         self.num_passed_over = 0
 
@@ -87,8 +91,8 @@ class SilabsStream:
         if len(tag) > MAX_NAME:
             self._tell(locator, f"the tag '{in_log(tag)}' has {len(tag)} characters; give it at most {MAX_NAME}")
             return []
-        if len(payload) > MAX_PAYLOAD:
-            self._tell(locator, f"the message has {len(payload)} bytes; an angle has at most {MAX_PAYLOAD}")
+        if len(payload) > self._payload_bytes:
+            self._tell(locator, f"the message has {len(payload)} bytes; an angle may have {self._payload_bytes}")
             return []
         station_id = station_of(locator, self._stations)
         if station_id not in self._known:

@@ -11,7 +11,8 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
 from rayfix_service.wire import FieldProblem, MalformedJsonError, more_problems, problems_of
-from rayfix_service.wire.problems import MAX_PROBLEMS, parameter_problem
+from rayfix_service.wire.limits import USUAL_LIMITS
+from rayfix_service.wire.problems import parameter_problem
 from rayfix_tables.errors import ReportError
 from rayfix_tables.problems import path_text
 
@@ -88,7 +89,9 @@ class Problem(BaseModel):
     title: str = Field(description="the kind of problem in words", examples=[INVALID_REPORT.title])
     status: int = Field(description="the HTTP status", examples=[INVALID_REPORT.status])
     detail: str = Field(description="what is wrong this time, and what to do about it")
-    errors: list[ProblemField] = Field(description=f"the offending fields, at most {MAX_PROBLEMS}")
+    errors: list[ProblemField] = Field(
+        description=f"the offending fields, at most {USUAL_LIMITS.listed_problems} unless the service is set otherwise"
+    )
     more_errors: int = Field(
         default=0, description="how many offending fields are left out of errors; absent when none is"
     )
@@ -167,7 +170,7 @@ async def _answer_validation(request: Request, error: Exception) -> JSONResponse
     """Answer a parameter that FastAPI itself refuses, such as one of a query."""
     assert isinstance(error, RequestValidationError | WebSocketRequestValidationError)
     errors = [parameter_problem(detail) for detail in error.errors()]
-    listed = errors[:MAX_PROBLEMS]
+    listed = errors[: USUAL_LIMITS.listed_problems]
     return problem_response(problem_document(INVALID_PARAMETER, errors[0].message, listed, len(errors) - len(listed)))
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rayfix_service.adapters.omlox_hub import HubSettings
+from rayfix_service.wire.limits import MessageLimits
 from rayfix_tables.checked import CheckLimits
 
 
@@ -66,6 +67,7 @@ class ServiceSettings:
     Attributes
     ----------
     body_limits : BodyLimits
+    message_limits : MessageLimits
     connection_limits : ConnectionLimits
     feed_limits : FeedLimits
     api_keys : pathlib.Path, optional
@@ -106,6 +108,7 @@ class ServiceSettings:
     """
 
     body_limits: BodyLimits = field(default_factory=BodyLimits)
+    message_limits: MessageLimits = field(default_factory=MessageLimits)
     connection_limits: ConnectionLimits = field(default_factory=ConnectionLimits)
     feed_limits: FeedLimits = field(default_factory=FeedLimits)
     api_keys: Path | None = None

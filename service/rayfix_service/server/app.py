@@ -178,6 +178,7 @@ def create_app(
                         slow_work=slow_work,
                         hub=hub,
                         quick_seconds=settings.quick_fix_seconds,
+                        message_limits=settings.message_limits,
                     )
                     services = Services(
                         settings=settings,

@@ -80,7 +80,8 @@ async def post_simulation(request: Request, services: ServicesDep, served: Table
 )
 async def post_posterior(request: Request, services: ServicesDep, served: TableDep, body: ReportBody) -> JSONResponse:
     """Give the Gaussians of the posterior and positions drawn from it, for pictures."""
-    return JSONResponse(await services.slow_work.locate(_on(served.locator, picture_posterior), parse_report(body)))
+    incoming = await services.answerer.read_report(body)
+    return JSONResponse(await services.slow_work.locate(_on(served.locator, picture_posterior), incoming.report))
 
 
 class _Work(Protocol[Asked_contra]):

@@ -9,18 +9,15 @@ import re
 from pydantic_core import to_json
 
 from rayfix_service.wire.documents import MAX_REPORTS
-from rayfix_service.wire.limits import MAX_DEPTH, TOKEN
+from rayfix_service.wire.limits import MAX_DEPTH, TOKEN, USUAL_LIMITS, MessageLimits
 from rayfix_service.wire.problems import FieldProblem, InvalidReportError, MalformedJsonError
 from rayfix_service.wire.request import read_json
 from rayfix_tables.problems import Path, path_text
 
-_LONGEST_REST = 64 << 10
-"""Bytes that a batch may have beside its reports."""
-
 _HEAD = re.compile(rb'\s*\{\s*"reports"\s*:\s*\[')
 
 
-def split_batch(body: bytes) -> list[bytes]:
+def split_batch(body: bytes, *, limits: MessageLimits = USUAL_LIMITS) -> list[bytes]:
     """Return the JSON texts of a batch's reports, each of which may still be anything.
 
     Raises
@@ -32,12 +29,12 @@ def split_batch(body: bytes) -> list[bytes]:
     """
     head = _HEAD.match(body)
     if head is None:
-        return _short_batch(body)
+        return _short_batch(body, limits)
     reports, end = _elements(body, head.end())
     rest = len(body) - end
-    if rest > _LONGEST_REST:
+    if rest > limits.batch_rest_bytes:
         raise _refused((), f"the batch has {rest} bytes after its reports; a batch has the key reports alone")
-    if _short_batch(body[: head.end()] + body[end:]):
+    if _short_batch(body[: head.end()] + body[end:], limits):
         raise _refused(("reports",), "reports is there twice; give one array")
     return reports
 
@@ -71,9 +68,9 @@ def _elements(body: bytes, begin: int) -> tuple[list[bytes], int]:
 _COMMA = ord(",")
 
 
-def _short_batch(body: bytes) -> list[bytes]:
+def _short_batch(body: bytes, limits: MessageLimits) -> list[bytes]:
     """Take a batch apart by parsing it as a whole."""
-    if len(body) > len(b'{"reports":[') + _LONGEST_REST:
+    if len(body) > len(b'{"reports":[') + limits.batch_rest_bytes:
         raise _refused((), 'the batch does not begin with its reports; give {"reports": [...]}')
     document = read_json(body)
     path: Path = ()

@@ -2,13 +2,44 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, get_args
 
 from pydantic import BaseModel
 
-MAX_VALUES = 5000
-"""Values that the JSON text of a report may have, keys and elements counted; one of 256 full measurements has 3300."""
+
+@dataclass(frozen=True, kw_only=True)
+class MessageLimits:
+    """What a message may hold, counted before the rest of it is looked at, and what is said of one that is refused.
+
+    Attributes
+    ----------
+    report_values : int
+        Values of the JSON text of a report, keys and elements counted; one of 256 full measurements has 3300.
+    message_values : int
+        Values of the JSON text of a message of another format, those that are not read counted.
+    results : int
+        Measurements of an NRPPa message, all TRPs together, each angle of a MultipleULAoA counted; with the ranges that
+        ``ue_rx_tx`` makes of them, twice as many.
+    stations : int
+        Names in the map of stations of a message.
+    batch_rest_bytes : int
+        Bytes of a batch beside its reports.
+    listed_problems : int
+        Offending fields that a problem lists, those of a batch together; the others are counted.
+    """
+
+    report_values: int = 5000
+    message_values: int = 50_000
+    results: int = 1024
+    stations: int = 1024
+    batch_rest_bytes: int = 64 << 10
+    listed_problems: int = 50
+
+
+USUAL_LIMITS = MessageLimits()
+"""Those of who sets none."""
 
 MAX_DEPTH = 200
 """Levels of a JSON text; its parser ends at the next."""

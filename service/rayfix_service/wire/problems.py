@@ -17,13 +17,10 @@ from pydantic_core import ErrorDetails
 
 from rayfix_service.wire.documents import ReportDocument
 from rayfix_service.wire.fields import MISFIT, WireModel
-from rayfix_service.wire.limits import models_within, names_of, trimmed
+from rayfix_service.wire.limits import USUAL_LIMITS, models_within, names_of, trimmed
 from rayfix_service.wire.measurements import MEASUREMENT_DOCUMENTS
 from rayfix_tables.errors import ReportError
 from rayfix_tables.problems import Path, path_text, shown, unknown_key
-
-MAX_PROBLEMS = 50
-"""Problems that an error lists; it counts the others. A megabyte of unknown keys must not become megabytes of text."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,18 +49,17 @@ class InvalidReportError(ReportError):
     Parameters
     ----------
     problems : tuple of FieldProblem
-        At least one; the first gives the error its message and its ``path``. Those beyond ``MAX_PROBLEMS`` are counted
-        and left out.
+        At least one; the first gives the error its message and its ``path``.
     more : int
-        Problems that were found besides.
+        Problems that were found besides. A megabyte of unknown keys must not become megabytes of text.
     """
 
     def __init__(self, problems: tuple[FieldProblem, ...], more: int = 0) -> None:
         others = len(problems) - 1 + more
         text = f" (and {others} more)" if others else ""
         super().__init__(problems[0].message + text, path=problems[0].path)
-        self.problems = problems[:MAX_PROBLEMS]
-        self.more = more + len(problems) - len(self.problems)
+        self.problems = problems
+        self.more = more
 
     def __reduce__(self) -> tuple[type["InvalidReportError"], tuple[tuple[FieldProblem, ...], int]]:
         """Pickle what it is made from: processes of a batch hand errors to each other."""
@@ -87,7 +83,7 @@ def invalid_report(
     model: type[WireModel],
     document: object,
     what: str,
-    most: int = MAX_PROBLEMS,
+    most: int = USUAL_LIMITS.listed_problems,
 ) -> InvalidReportError:
     """Translate pydantic's errors of a document into this project's messages.
 
@@ -106,12 +102,13 @@ def invalid_report(
         Problems that the error lists at most, the first ones; the others are counted.
     """
     found = error.error_count()
-    if found > MAX_PROBLEMS:
+    looked_at = max(most, USUAL_LIMITS.listed_problems)
+    if found > looked_at:
         try:
-            model.model_validate(trimmed(document, names_of(model), MAX_PROBLEMS))
+            model.model_validate(trimmed(document, names_of(model), looked_at))
         except ValidationError as fewer:
             error = fewer
-    details = error.errors(include_url=False)[:MAX_PROBLEMS]
+    details = error.errors(include_url=False)[:looked_at]
     # A misspelt key comes with a missing one; the first message should name the misspelt one.
     details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
     problems = tuple(problem_of(model, detail, what) for detail in details[:most])

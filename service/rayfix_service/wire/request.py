@@ -9,9 +9,8 @@ from pydantic_core import from_json
 
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.wire.documents import MAX_MEASUREMENTS, ReportDocument
-from rayfix_service.wire.limits import MAX_VALUES, has_more_values
+from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits, has_more_values
 from rayfix_service.wire.problems import (
-    MAX_PROBLEMS,
     FieldProblem,
     InvalidReportError,
     MalformedJsonError,
@@ -42,15 +41,14 @@ def read_json(body: bytes) -> object:
         raise MalformedJsonError(f"the document is not JSON: {error}; give one complete JSON object in UTF-8") from None
 
 
-def parse_report(document: Mapping[str, Any] | bytes, *, most_problems: int = MAX_PROBLEMS) -> Report:
+def parse_report(document: Mapping[str, Any] | bytes, *, limits: MessageLimits = USUAL_LIMITS) -> Report:
     """Turn a report's JSON into a :class:`Report`.
 
     Parameters
     ----------
     document : Mapping or bytes
         The parsed document, or its JSON text.
-    most_problems : int
-        Problems that an error lists at most; it counts the others.
+    limits : MessageLimits, optional
 
     Raises
     ------
@@ -61,9 +59,9 @@ def parse_report(document: Mapping[str, Any] | bytes, *, most_problems: int = MA
     """
     if isinstance(document, bytes):
         document = document.removeprefix(codecs.BOM_UTF8)
-        model = _validate_text(document, most_problems)
+        model = _validate_text(document, limits)
     else:
-        model = _validate(document, most_problems)
+        model = _validate(document, limits)
     return Report(
         measurements=tuple(m.measurement() for m in model.measurements),
         height=None if model.height is None else model.height.height(),
@@ -73,19 +71,20 @@ def parse_report(document: Mapping[str, Any] | bytes, *, most_problems: int = MA
     )
 
 
-def _validate_text(text: bytes, most_problems: int) -> ReportDocument:
-    if len(text) > _SHORT and has_more_values(text, MAX_VALUES):
-        message = f"the report has more than {MAX_VALUES} values; give at most {MAX_MEASUREMENTS} measurements"
+def _validate_text(text: bytes, limits: MessageLimits) -> ReportDocument:
+    most = limits.report_values
+    if len(text) > min(_SHORT, most) and has_more_values(text, most):
+        message = f"the report has more than {most} values; give at most {MAX_MEASUREMENTS} measurements"
         raise InvalidReportError((FieldProblem(path=(), message=message),))
     try:
         return ReportDocument.model_validate_json(text)  # three times faster than by way of a dict
     except ValidationError:
-        return _validate(read_json(text), most_problems)  # finds the same, and has the values for the messages
+        return _validate(read_json(text), limits)  # finds the same, and has the values for the messages
 
 
-def _validate(data: object, most_problems: int) -> ReportDocument:
+def _validate(data: object, limits: MessageLimits) -> ReportDocument:
     document = dict(data) if isinstance(data, Mapping) else data
     try:
         return ReportDocument.model_validate(document)
     except ValidationError as error:
-        raise invalid_report(error, ReportDocument, document, "the report", most_problems) from None
+        raise invalid_report(error, ReportDocument, document, "the report", limits.listed_problems) from None

@@ -28,7 +28,7 @@ RUN = """\
     import os, sys, time
     from rayfix_service.server import workers
 
-    workers._LOOK_SECONDS, workers._SILENT_LOOKS = 0.02, 25
+    workers._LOOK_SECONDS, workers._SILENT_LOOKS = 0.02, {silent_looks}
 
     def work():
         print("worker", os.getpid(), flush=True)
@@ -37,6 +37,9 @@ RUN = """\
     workers.run_workers(work, count=2, meanwhile=lambda: None, ending=lambda: None)
     print("ended", flush=True)
     """
+MANY_LOOKS = (
+    5000  # a worker of a busy machine may take seconds to its first beat, and must not be taken for one that hangs
+)
 SERVE = """\
     import sys
     from rayfix_service.http.answering import table_checks
@@ -87,7 +90,7 @@ def ends(pid: int) -> bool:
 
 
 def test_a_worker_that_dies_or_hangs_is_replaced_and_all_end_together():
-    with service(RUN.format(work="time.sleep(60)")) as run:
+    with service(RUN.format(work="time.sleep(60)", silent_looks=100)) as run:
         first, second = run.worker(), run.worker()
         os.kill(first, signal.SIGKILL)
         third = run.worker()
@@ -104,14 +107,14 @@ def test_a_worker_that_dies_or_hangs_is_replaced_and_all_end_together():
 
 
 def test_workers_whose_service_is_killed_end_by_themselves():
-    with service(RUN.format(work="time.sleep(60)")) as run:
+    with service(RUN.format(work="time.sleep(60)", silent_looks=MANY_LOOKS)) as run:
         pids = [run.worker(), run.worker()]
         run.process.kill()
         assert all(ends(pid) for pid in pids)
 
 
 def test_workers_none_of_which_can_start_end_the_service():
-    with service(RUN.format(work="sys.exit(workers.COULD_NOT_START)")) as run:
+    with service(RUN.format(work="sys.exit(workers.COULD_NOT_START)", silent_looks=MANY_LOOKS)) as run:
         pids = [run.worker(), run.worker()]
         run.read("ServiceError: a worker could not start; the log has the cause")
         assert run.process.wait(10) != 0

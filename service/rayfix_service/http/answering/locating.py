@@ -26,7 +26,7 @@ from rayfix_service.http.telemetry.metrics import Metrics
 from rayfix_service.locator import Locator
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report, report_to_document
-from rayfix_service.wire.problems import MAX_PROBLEMS
+from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits
 from rayfix_tables.errors import ReportError
 
 _log = logging.getLogger(__name__)
@@ -61,15 +61,15 @@ class Incoming:
         return report_to_document(self.report) if self.document is None else self.document
 
 
-def native(document: Mapping[str, Any] | bytes, *, most_problems: int = MAX_PROBLEMS) -> Incoming:
+def native(document: Mapping[str, Any] | bytes, *, limits: MessageLimits = USUAL_LIMITS) -> Incoming:
     """Read a report of this project's own format.
 
     Raises
     ------
     ReportError
-        When it cannot be used; of its problems it lists at most so many.
+        When it cannot be used.
     """
-    return Incoming(report=parse_report(document, most_problems=most_problems), document=document)
+    return Incoming(report=parse_report(document, limits=limits), document=document)
 
 
 def foreign(adapted: Adapted) -> Incoming:
@@ -101,6 +101,8 @@ class Answerer:
         To send positions to.
     quick_seconds : float
         What a fix may take on the event loop.
+    message_limits : MessageLimits
+        Of what is read.
     reading : asyncio.Lock
         The turn to read a long body.
     """
@@ -110,7 +112,18 @@ class Answerer:
     slow_work: SlowWork
     hub: OmloxHub | None
     quick_seconds: float = ServiceSettings.quick_fix_seconds
+    message_limits: MessageLimits = USUAL_LIMITS
     reading: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    async def read_report(self, body: bytes) -> Incoming:
+        """Read a report of this project's own format as :meth:`read` does.
+
+        Raises
+        ------
+        ReportError
+            When it cannot be used.
+        """
+        return await self.read(partial(native, limits=self.message_limits), body)
 
     async def read(self, parse: Callable[[bytes], T], body: bytes) -> T:
         """Parse a body: long ones in a thread, one at a time, so that other requests are answered meanwhile.

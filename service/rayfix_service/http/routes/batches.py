@@ -1,6 +1,7 @@
 """Answering the reports of a batch, each on its own."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -11,17 +12,18 @@ from rayfix_service.http.answering.cooperative import Cooperation
 from rayfix_service.http.answering.locating import Answerer, Incoming, problem_of
 from rayfix_service.http.answering.response_options import ResponseOptions
 from rayfix_service.http.answering.served_tables import ServedTable
+from rayfix_service.http.routes.json_answer import JsonAnswer, results_answer, write_json
 from rayfix_service.wire import MalformedJsonError
 from rayfix_service.wire.batches import split_batch
-from rayfix_service.wire.problems import MAX_PROBLEMS
+from rayfix_service.wire.limits import MessageLimits
 
-ReadOne = Callable[[bytes, int], Incoming]
-"""Reads the JSON text of one report, and lists at most so many problems of it."""
+ReadOne = Callable[[bytes, MessageLimits], Incoming]
+"""Reads the JSON text of one report."""
 
 
 async def answer_batch(
     request: Request, answerer: Answerer, table: ServedTable, body: bytes, options: ResponseOptions, read_one: ReadOne
-) -> list[dict[str, Any]]:
+) -> JsonAnswer:
     """Read all reports of a batch, then locate them in their order.
 
     Raises
@@ -31,37 +33,38 @@ async def answer_batch(
     ReportError
         For what is not a batch.
     """
-    texts = await answerer.read(split_batch, body)
+    limits = answerer.message_limits
+    texts = await answerer.read(partial(split_batch, limits=limits), body)
     charge_reports(request, len(texts))
     cooperation = Cooperation(request)
     reports: list[Incoming | dict[str, Any]] = []  # all, before the first is located: a batch is JSON or it is not
     listed = 0
     for number, text in enumerate(texts):
         await cooperation.let_others_run()
-        most = MAX_PROBLEMS if listed < MAX_PROBLEMS else 1
+        own = limits if listed < limits.listed_problems else replace(limits, listed_problems=1)
         try:
-            reports.append(await answerer.read(partial(_read, read_one, most), text))
+            reports.append(await answerer.read(partial(_read, read_one, own), text))
         except MalformedJsonError as error:
             raise MalformedJsonError(f"reports[{number}]: {error}") from None
         except Exception as error:
             problem = problem_of(error)
-            if (left_out := len(problem["errors"]) - most) > 0:
+            if (left_out := len(problem["errors"]) - own.listed_problems) > 0:
                 problem["more_errors"] = problem.get("more_errors", 0) + left_out
-                del problem["errors"][most:]
+                del problem["errors"][own.listed_problems :]
             reports.append(problem)
             listed += len(problem["errors"])
-    results: list[dict[str, Any]] = []
+    results: list[bytes] = []
     for report in reports:  # not by locate_batch: other batches keep the other workers, one for each core, as busy
         if isinstance(report, Incoming):
             await cooperation.let_others_run()
-            results.append(await answerer.answer_or_problem(table, partial(_itself, report), options))
+            results.append(write_json(await answerer.answer_or_problem(table, partial(_itself, report), options)))
         else:
-            results.append(report)
-    return results
+            results.append(write_json(report))
+    return results_answer(results)
 
 
-def _read(read_one: ReadOne, most_problems: int, text: bytes) -> Incoming:
-    return read_one(text, most_problems)
+def _read(read_one: ReadOne, limits: MessageLimits, text: bytes) -> Incoming:
+    return read_one(text, limits)
 
 
 def _itself(report: Incoming) -> Incoming:

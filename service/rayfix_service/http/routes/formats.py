@@ -1,7 +1,7 @@
 """Routes that locate from messages of other systems; docs/formats.md describes them."""
 
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, Field
@@ -37,8 +37,9 @@ from rayfix_service.http.routes.dependencies import (
     ReportBody,
     TableDep,
 )
-from rayfix_service.http.routes.json_answer import JsonAnswer
+from rayfix_service.http.routes.json_answer import JsonAnswer, results_answer, write_json
 from rayfix_service.http.routes.one_report import answer_one
+from rayfix_service.wire.limits import MessageLimits
 
 router = APIRouter(prefix="/v1/positions", tags=["formats"])
 
@@ -62,7 +63,7 @@ async def post_nrppa(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    return await answer_one(lambda text: foreign(parse_nrppa(text)), body, answerer, table, options)
+    return await answer_one(partial(_read_nrppa, limits=answerer.message_limits), body, answerer, table, options)
 
 
 @router.post(
@@ -76,7 +77,7 @@ async def post_silabs(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    return await answer_one(lambda text: foreign(parse_silabs(text)), body, answerer, table, options)
+    return await answer_one(partial(_read_silabs, limits=answerer.message_limits), body, answerer, table, options)
 
 
 @router.post(
@@ -90,7 +91,7 @@ async def post_nrppa_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Locate each message on its own; one that cannot be used gets a problem and leaves the others alone."""
-    return JsonAnswer({"results": await answer_batch(request, answerer, table, body, options, _read_nrppa)})
+    return await answer_batch(request, answerer, table, body, options, _read_nrppa)
 
 
 @router.post(
@@ -104,15 +105,15 @@ async def post_silabs_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Locate each packet on its own; one that cannot be used gets a problem and leaves the others alone."""
-    return JsonAnswer({"results": await answer_batch(request, answerer, table, body, options, _read_silabs)})
+    return await answer_batch(request, answerer, table, body, options, _read_silabs)
 
 
-def _read_nrppa(text: bytes, most_problems: int) -> Incoming:
-    return foreign(parse_nrppa(text))
+def _read_nrppa(text: bytes, limits: MessageLimits) -> Incoming:
+    return foreign(parse_nrppa(text, limits=limits))
 
 
-def _read_silabs(text: bytes, most_problems: int) -> Incoming:
-    return foreign(parse_silabs(text))
+def _read_silabs(text: bytes, limits: MessageLimits) -> Incoming:
+    return foreign(parse_silabs(text, limits=limits))
 
 
 @router.post(
@@ -142,12 +143,12 @@ async def post_ublox(
     ] = None,
 ) -> JsonAnswer:
     """Take ``+UUDF`` lines of u-blox anchors, join them by tag and sequence number, and locate each transmission."""
-    known, results = known_height(height_m, height_stdev_m), list[dict[str, Any]]()
+    known, results = known_height(height_m, height_stdev_m), list[bytes]()
     read = partial(parse, input_format="ublox", stations=station_map(station), height=known, confidence=confidence)
     messages = await answerer.read(read, body)
     charge_reports(request, len(messages))
     cooperation = Cooperation(request)
     for adapted in messages:
         await cooperation.let_others_run()
-        results.append(await answerer.answer_or_problem(table, partial(foreign, adapted), options))
-    return JsonAnswer({"results": results})
+        results.append(write_json(await answerer.answer_or_problem(table, partial(foreign, adapted), options)))
+    return results_answer(results)

@@ -22,15 +22,16 @@ from rayfix_service.http.routes.dependencies import (
     read_body,
 )
 from rayfix_service.http.routes.json_answer import JsonAnswer, write_json
-from rayfix_service.http.routes.one_report import answer_one
 from rayfix_service.http.services import services_in
 from rayfix_service.wire import BatchDocument, ReportDocument
+from rayfix_service.wire.limits import MessageLimits
 
 
 class BatchResult(BaseModel):
     """The answers to a batch, in the order of its reports.
 
-    All its problems together list some 50 fields; once they do, each further one lists its first and counts the others.
+    All its problems together list some 50 fields, or what the service is set to; once they do, each further one lists
+    its first and counts the others.
     """
 
     results: list[NativeOrOther | Problem] = Field(
@@ -52,7 +53,8 @@ async def post_position(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
-    return await answer_one(native, body, answerer, table, options)
+    incoming = await answerer.read_report(body)
+    return JsonAnswer(await answerer.answer(table, incoming, options), media_type=options.media_type)
 
 
 async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple[bytes, str]:
@@ -66,7 +68,7 @@ async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple
     table = services.tables.named(None)
     body = await read_body(scope, receive, services.settings.body_limits.report)
     options = response_options_of(scope, services.settings)
-    incoming = await answerer.read(native, body)
+    incoming = await answerer.read_report(body)
     await asyncio.sleep(0)
     located = await answerer.locate(table, incoming, options)
     await asyncio.sleep(0)
@@ -84,8 +86,8 @@ async def post_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
-    return JsonAnswer({"results": await answer_batch(request, answerer, table, body, options, _read_native)})
+    return await answer_batch(request, answerer, table, body, options, _read_native)
 
 
-def _read_native(text: bytes, most_problems: int) -> Incoming:
-    return native(text, most_problems=most_problems)
+def _read_native(text: bytes, limits: MessageLimits) -> Incoming:
+    return native(text, limits=limits)

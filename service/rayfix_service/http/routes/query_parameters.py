@@ -9,7 +9,7 @@ from starlette.requests import HTTPConnection
 
 from rayfix_service.http.problems import INVALID_PARAMETER, ProblemError
 from rayfix_service.wire import FieldProblem
-from rayfix_service.wire.problems import MAX_PROBLEMS
+from rayfix_service.wire.limits import USUAL_LIMITS
 from rayfix_tables.problems import shown
 
 
@@ -32,7 +32,10 @@ async def refuse_unknown_parameters(connection: HTTPConnection) -> None:
     unknown = list(dict.fromkeys(name for name in connection.query_params if name not in names))
     if unknown:
         known = sorted(names)
-        problems = [FieldProblem(path=(name,), message=_message(name, known)) for name in unknown[:MAX_PROBLEMS]]
+        problems = [
+            FieldProblem(path=(name,), message=_message(name, known))
+            for name in unknown[: USUAL_LIMITS.listed_problems]
+        ]
         raise ProblemError(INVALID_PARAMETER, problems[0].message, errors=problems)
 
 

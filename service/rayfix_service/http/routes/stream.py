@@ -15,7 +15,6 @@ from starlette.websockets import WebSocketDisconnect, WebSocketDisconnected
 
 from rayfix_service.http.access.guard import client_of, limit_of, until_revoked
 from rayfix_service.http.answering.feed import FixEvent
-from rayfix_service.http.answering.locating import native
 from rayfix_service.http.answering.response_options import ResponseOptions
 from rayfix_service.http.openapi.examples import FIX_EVENT_EXAMPLE
 from rayfix_service.http.problems import (
@@ -200,7 +199,7 @@ async def _answer(services: Services, table: str | None, body: bytes, options: R
     except ProblemError as error:
         return problem_document(error.kind, str(error), error.errors)
     answerer = services.answerer
-    return await answerer.answer_or_problem(served, partial(answerer.read, native, body), options)
+    return await answerer.answer_or_problem(served, partial(answerer.read_report, body), options)
 
 
 async def _next_message(websocket: WebSocket) -> bytes:
