@@ -7,6 +7,7 @@ from typing import Any
 
 from rayfix_service.adapters.adapted import check_stations, error_in_message
 from rayfix_service.adapters.formats import InputFormat, OutputFormat, parse, write
+from rayfix_service.adapters.ublox import USUAL_ERRORS, AngleErrors
 from rayfix_service.fusion.measurements.report import Height
 from rayfix_service.locator import Locator
 from rayfix_tables.checked import open_checked
@@ -22,6 +23,7 @@ def locate_file(
     stations: Mapping[str, str] | None = None,
     height: Height | None = None,
     confidence: float | None = None,
+    errors: AngleErrors | None = None,
 ) -> list[dict[str, Any]]:
     """Answer a file as the HTTP interface does: with one position, or with one for each epoch of u-blox lines.
 
@@ -36,6 +38,8 @@ def locate_file(
         Prior of the target's height, for reports without one.
     confidence : float, optional
         Probability with which accuracies are to hold, instead of the report's.
+    errors : AngleErrors, optional
+        Of the angles of u-blox lines, which state none.
 
     Raises
     ------
@@ -46,6 +50,10 @@ def locate_file(
     """
     if stations and input_format == "native":
         raise ReportError("a native report names the stations of the table; --station is for other systems' messages")
+    if errors is not None and input_format != "ublox":
+        raise ReportError(
+            f"{input_format} reports state the deviations of their angles; --stdev and --tails are for u-blox lines"
+        )
     try:
         body = report_path.read_bytes()
     except OSError as error:
@@ -55,7 +63,15 @@ def locate_file(
     locator = Locator(table)
     answers = []
     try:
-        for adapted in parse(body, input_format, stations=stations, height=height, confidence=confidence):
+        found = parse(
+            body,
+            input_format,
+            stations=stations,
+            height=height,
+            confidence=confidence,
+            errors=errors or USUAL_ERRORS,
+        )
+        for adapted in found:
             begin = time.perf_counter()
             try:
                 fix = locator.locate(adapted.report)

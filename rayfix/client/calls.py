@@ -193,6 +193,8 @@ def lines_call(
     stations: Mapping[str, str] | None,
     height: tuple[float, float] | None,
     confidence: float | None,
+    stdev_deg: float | None = None,
+    tails: tuple[float, float] | None = None,
 ) -> Call:
     """Call for the positions of u-blox lines; a height is z and its standard deviation, m."""
     pairs = [(key, value) for key, value in query.items()]
@@ -201,6 +203,10 @@ def lines_call(
         pairs += [("height_m", repr(height[0])), ("height_stdev_m", repr(height[1]))]
     if confidence is not None:
         pairs.append(("confidence", repr(confidence)))
+    if stdev_deg is not None:
+        pairs.append(("stdev_deg", repr(stdev_deg)))
+    if tails is not None:
+        pairs += [("tail_share", repr(tails[0])), ("tail_scale", repr(tails[1]))]
     path = f"/v1/positions/ublox?{urlencode(pairs)}" if pairs else "/v1/positions/ublox"
     return Call(method="POST", path=path, headers={"content-type": "text/plain"}, body=lines.encode())
 

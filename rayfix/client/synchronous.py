@@ -155,6 +155,8 @@ class Client:
         stations: Mapping[str, str] | None = None,
         height: tuple[float, float] | None = None,
         confidence: float | None = None,
+        stdev_deg: float | None = None,
+        tails: tuple[float, float] | None = None,
     ) -> list[FixAnswer | ProblemError]:
         """Locate from ``+UUDF`` lines of u-blox anchors: an answer for each transmission of each tag.
 
@@ -167,9 +169,21 @@ class Client:
             Known height of the tags and its standard deviation.
         confidence : float, optional
             Probability with which accuracies are to hold.
+        stdev_deg : float, deg, optional
+            Standard deviation of the angles, which the lines do not state.
+        tails : tuple of 2 floats, optional
+            Probability that an angle's error is of a wider Gaussian, and that one's standard deviation in those of the
+            other.
         """
-        query = self.settings.position_query
-        call = lines_call(lines, query, stations=stations, height=height, confidence=confidence)
+        call = lines_call(
+            lines,
+            self.settings.position_query,
+            stations=stations,
+            height=height,
+            confidence=confidence,
+            stdev_deg=stdev_deg,
+            tails=tails,
+        )
         return self._ask(call, lines_answers)
 
     def stations(self) -> tuple[StationAnswer, ...]:

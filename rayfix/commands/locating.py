@@ -27,6 +27,17 @@ def add_commands(add: AddCommand) -> None:
     locate.add_argument("--format", choices=_INPUTS, default="native", help="format of the report (default: native)")
     add_output_arguments(locate)
     add_confidence_argument(locate)
+    locate.add_argument(
+        "--stdev", type=float, metavar="DEG", help="standard deviation of the angles of u-blox lines (default: 10)"
+    )
+    locate.add_argument(
+        "--tails",
+        type=float,
+        nargs=2,
+        metavar=("SHARE", "SCALE"),
+        help="probability that an error of such an angle is of a wider Gaussian, and by how much it is wider "
+        "(default: 0.2 3)",
+    )
     locate.add_argument("--json", action="store_true", help="the answer of the HTTP interface")
 
     mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: angles of Silicon Labs locators in, positions out")
@@ -63,6 +74,12 @@ def _locate(options: argparse.Namespace) -> int:
         from rayfix.console import print_fix
         from rayfix.locate import locate_file
         from rayfix_service.adapters.adapted import known_height, station_map
+        from rayfix_service.adapters.ublox import USUAL_ERRORS, AngleErrors
+    errors = None
+    if options.stdev is not None or options.tails is not None:
+        share, scale = options.tails or (USUAL_ERRORS.tail_share, USUAL_ERRORS.tail_scale)
+        stdev = USUAL_ERRORS.stdev_deg if options.stdev is None else options.stdev
+        errors = AngleErrors(stdev_deg=stdev, tail_share=share, tail_scale=scale)
     answers = locate_file(
         options.table,
         options.report,
@@ -71,6 +88,7 @@ def _locate(options: argparse.Namespace) -> int:
         stations=station_map(options.station),
         height=known_height(*(options.height or (None, None))),
         confidence=options.confidence,
+        errors=errors,
     )
     for document in answers:
         if options.json or options.output != "native":

@@ -125,7 +125,7 @@ class Locator:
     def fuse(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Fused:
         """Locate a report and keep its likelihood, for :class:`~rayfix_service.tracking.tracker.Tracker`.
 
-        It does not :meth:`explain` the fix.
+        It does not :meth:`explain` the fix. For a report with a known height it takes twice as long as the fix.
 
         Parameters
         ----------
@@ -133,7 +133,11 @@ class Locator:
         stop : Stop
             As of :meth:`locate`, and so are the errors.
         """
-        return self._fused(_read(report), stop)
+        report = _read(report)
+        fused = self._fused(report, stop)
+        if report.height is None:
+            return fused
+        return replace(fused, likelihood=self._fusion.product(replace(report, height=None), stop).hypotheses)
 
     def posterior(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Posterior:
         """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.
@@ -176,7 +180,7 @@ class Locator:
         fix = make_fix(report, product, self.table, self.settings, stop)
         if fix.status == "inconsistent":
             fix = replace(fix, warnings=(suspects(report, fix),))
-        return Fused(fix=fix, hypotheses=product.hypotheses, prior=product.prior)
+        return Fused(fix=fix, hypotheses=product.hypotheses, prior=product.prior, likelihood=product.hypotheses)
 
 
 def _read(report: Report | Mapping[str, Any]) -> Report:

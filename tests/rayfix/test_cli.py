@@ -85,6 +85,19 @@ def test_example_check_build_info_verify_locate(
     assert re.match(r"ok: \(\d+\.\d\d, \d+\.\d\d, \d+\.\d\d\) m\n", out)
 
 
+def test_errors_of_angles_are_for_lines_that_state_none(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, hall_table_path: Path
+) -> None:
+    report = tmp_path / "report.json"
+    report.write_text("{}", encoding="utf-8")
+    status, out, err = run(capsys, "locate", hall_table_path, report, "--stdev", "3")
+    assert (status, out) == (2, "")
+    assert "--stdev and --tails are for u-blox lines" in one_line(err)
+    status, out, err = run(capsys, "locate", hall_table_path, report, "--format", "ublox", "--stdev", "0")
+    assert (status, out) == (2, "")
+    assert "stdev_deg" in one_line(err)
+
+
 def test_locate_takes_and_gives_other_formats(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, hall_table_path: Path
 ) -> None:
@@ -99,12 +112,13 @@ def test_locate_takes_and_gives_other_formats(
         encoding="utf-8",
     )
     stations = [word for n in (1, 2, 3, 4) for word in ("--station", f"A{n}=bs{n}")]
-    command = ("locate", hall_table_path, lines, "--format", "ublox", *stations)
+    errors = ("--stdev", "3", "--tails", "0", "1")
+    command = ("locate", hall_table_path, lines, "--format", "ublox", *stations, *errors)
     status, out, err = run(capsys, *command, "--output", "omlox")
     assert (status, err) == (0, "")
     locations = [json.loads(line) for line in out.splitlines()]
     assert [location["provider_id"] for location in locations] == ["TAG1", "TAG2"]
-    # The target stands there; anchors of 5 deg tell its height from 8 m to 0.7 m each.
+    # The target stands there; anchors of 3 deg tell its height from 8 m to 0.4 m each.
     for location in locations:
         assert np.linalg.norm(np.subtract(location["position"]["coordinates"], [7.0, 4.0, 1.5])) < 0.7
     status, out, err = run(capsys, *command)

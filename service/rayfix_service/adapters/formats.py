@@ -1,6 +1,7 @@
 """The formats by their names, as the command line and the HTTP interface know them."""
 
 from collections.abc import Mapping
+from datetime import datetime
 from typing import Any, Literal
 
 from rayfix_service.adapters.adapted import Adapted, with_confidence, with_height
@@ -8,7 +9,7 @@ from rayfix_service.adapters.nrppa import parse_nrppa
 from rayfix_service.adapters.omlox import fix_to_omlox
 from rayfix_service.adapters.silabs import parse_silabs
 from rayfix_service.adapters.threegpp import fix_to_3gpp
-from rayfix_service.adapters.ublox import parse_ublox
+from rayfix_service.adapters.ublox import USUAL_ERRORS, AngleErrors, parse_ublox
 from rayfix_service.fusion.measurements.report import Height
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.tracking.track import TrackedPosition
@@ -27,6 +28,8 @@ def parse(
     stations: Mapping[str, str] | None = None,
     height: Height | None = None,
     confidence: float | None = None,
+    errors: AngleErrors = USUAL_ERRORS,
+    received: datetime | None = None,
 ) -> tuple[Adapted, ...]:
     """Turn a message into reports: one, or for u-blox lines one for each transmission.
 
@@ -41,6 +44,10 @@ def parse(
         Known height of the target, for messages without one.
     confidence : float, optional
         Probability with which accuracies are to hold, instead of that of the message.
+    errors : AngleErrors, optional
+        Of the angles of u-blox lines, which state none.
+    received : datetime, optional
+        When the message was received: u-blox lines without a time get theirs from it.
 
     Raises
     ------
@@ -51,22 +58,25 @@ def parse(
     ReportError
         For a confidence that is out of range.
     """
-    found = _parse(body, input_format, stations)
+    if input_format == "ublox":
+        found = parse_ublox(body, stations=stations, errors=errors, received=received)
+    else:
+        found = (_parse_one(body, input_format, stations),)
     return tuple(with_confidence(with_height(adapted, height), confidence) for adapted in found)
 
 
-def _parse(body: bytes, input_format: InputFormat, stations: Mapping[str, str] | None) -> tuple[Adapted, ...]:
+def _parse_one(
+    body: bytes, input_format: Literal["native", "nrppa", "silabs"], stations: Mapping[str, str] | None
+) -> Adapted:
     match input_format:
         case "native":
             report = parse_report(body)
             places = tuple(("measurements", n) for n in range(len(report.measurements)))
-            return (Adapted(report=report, sources=places),)
+            return Adapted(report=report, sources=places)
         case "nrppa":
-            return (parse_nrppa(body, stations=stations),)
+            return parse_nrppa(body, stations=stations)
         case "silabs":
-            return (parse_silabs(body, stations=stations),)
-        case "ublox":
-            return parse_ublox(body, stations=stations)
+            return parse_silabs(body, stations=stations)
 
 
 def write(

@@ -3,20 +3,60 @@
 import csv
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Annotated
 
 from rayfix_service.adapters.adapted import Adapted, Skipped, adapted_report, station_of
 from rayfix_service.adapters.transmissions import Joiner, Transmission
-from rayfix_service.fusion.measurements.report import Angle
+from rayfix_service.fusion.measurements.report import Angle, ErrorModel
 from rayfix_service.wire import MAX_REPORTS, FieldProblem, InvalidReportError
 from rayfix_tables.angles import wrap_one
+from rayfix_tables.limits import Limits, check_limits
 from rayfix_tables.problems import Path, shown
 
-STDEV_DEG = 5.0
-"""Anchors give no uncertainty; this is taken for the standard deviation of their angles."""
-
 _PREFIX = "+UUDF:"
+
+_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d{1,9})?(?:Z|[+-]\d\d:?\d\d)?")
+"""A log's time before an event: ISO 8601, UTC where it names no zone."""
+
+_LISTED = 20
+"""Lines that cannot be read are listed one by one up to this many; the others are counted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AngleErrors:
+    """Errors of anchors' angles, which the anchors do not report.
+
+    The defaults are those of recorded angles indoors (docs/real-data.md): most errors have a standard deviation of some
+    10 deg, one in five is of a distribution three times as wide.
+
+    Attributes
+    ----------
+    stdev_deg : float, deg
+        Standard deviation of azimuth and elevation.
+    tail_share : float
+        Probability that the error is of the wider Gaussian.
+    tail_scale : float
+        Standard deviation of the wider Gaussian, in those of the other.
+
+    Raises
+    ------
+    SettingsError
+        When a value is out of its range.
+    """
+
+    stdev_deg: Annotated[float, Limits(least=1e-3, most=180.0)] = 10.0
+    tail_share: Annotated[float, Limits(least=0.0, below=1.0)] = 0.2
+    tail_scale: Annotated[float, Limits(least=1.0, most=100.0)] = 3.0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        check_limits(self)
+
+
+USUAL_ERRORS = AngleErrors()
 
 _INTEGERS = (
     (1, "rssi_pol1", -1000, 1000),
@@ -101,9 +141,9 @@ def parse_uudf(line: str) -> UudfEvent:
     )
 
 
-def ublox_angle(event: UudfEvent, station_id: str, *, stdev_deg: float = STDEV_DEG) -> Angle:
+def ublox_angle(event: UudfEvent, station_id: str, *, errors: AngleErrors = USUAL_ERRORS) -> Angle:
     """Turn an event into an angle of the anchor's local frame, whose x axis is the boresight."""
-    stdev = math.radians(stdev_deg)
+    stdev = math.radians(errors.stdev_deg)
     return Angle(
         station_id=station_id,
         azimuth=wrap_one(math.radians(-event.azimuth)),
@@ -111,17 +151,35 @@ def ublox_angle(event: UudfEvent, station_id: str, *, stdev_deg: float = STDEV_D
         zenith=math.radians(90 - event.elevation),
         zenith_stdev=stdev,
         frame="lcs",
+        error_model=ErrorModel(tail_share=errors.tail_share, tail_scale=errors.tail_scale),
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Line:
+    """An event, the number of its line, and the time that the line has before it."""
+
+    number: int
+    event: UudfEvent
+    logged: datetime | None
+
+
 def parse_ublox(
-    text: str | bytes, *, stations: Mapping[str, str] | None = None, stdev_deg: float = STDEV_DEG
+    text: str | bytes,
+    *,
+    stations: Mapping[str, str] | None = None,
+    errors: AngleErrors = USUAL_ERRORS,
+    received: datetime | None = None,
 ) -> tuple[Adapted, ...]:
     """Turn the lines of several anchors into reports, one for each transmission of each tag.
 
     Lines with one sequence number belong together. Where there is none, an anchor that reports a tag again begins
-    that tag's next report: anchors' clocks differ. In a line, what stands before ``+UUDF:`` is passed over, such as a
-    log's time. Lines without it are passed over too, and counted in what the first report skips.
+    that tag's next report: anchors' clocks differ. What stands before ``+UUDF:`` in a line is not read, except for a
+    log's time. A line without an event, or whose event is not valid, is left out; the first report lists it in what it
+    skips.
+
+    A report's time is that of its first line in the log. Where lines have none, it is counted back from ``received``,
+    the time of the last line, by the clocks of the anchors; without ``received`` the report has no time.
 
     Parameters
     ----------
@@ -129,19 +187,22 @@ def parse_ublox(
         Lines in UTF-8.
     stations : Mapping, optional
         Stations by anchor id; an anchor that it does not have is itself a station's identifier.
-    stdev_deg : float, deg
-        Standard deviation of the angles.
+    errors : AngleErrors, optional
+    received : datetime, optional
+        When the lines were received, with a time zone.
 
     Raises
     ------
     InvalidReportError
-        For a line that is not valid, no such line at all, or too many reports.
+        When no line has a valid event, or for too many reports.
     """
     if isinstance(text, bytes):
         text = text.decode("utf-8", errors="replace")
-    joiner: Joiner[tuple[int, UudfEvent]] = Joiner(window=math.inf)
-    joined: list[Transmission[tuple[int, UudfEvent]]] = []
+    joiner: Joiner[_Line] = Joiner(window=math.inf)
+    joined: list[Transmission[_Line]] = []
     others: list[int] = []
+    faulty: list[FieldProblem] = []
+    latest: dict[str, int] = {}
     for number, line in enumerate(text.splitlines()):
         place = line.find(_PREFIX)
         if place < 0:
@@ -152,28 +213,78 @@ def parse_ublox(
             event = parse_uudf(line[place:])
         except InvalidReportError as error:
             message = f"line {number + 1} {str(error).removeprefix('the line ')}"
-            raise InvalidReportError((FieldProblem(path=("lines", number), message=message),)) from None
-        joined += joiner.add(event.tag, event.anchor, event.sequence, (number, event), 0.0)
+            faulty.append(FieldProblem(path=("lines", number), message=message))
+            continue
+        latest[event.anchor] = event.timestamp_ms
+        found = _Line(number=number, event=event, logged=_logged(line[:place]))
+        joined += joiner.add(event.tag, event.anchor, event.sequence, found, 0.0)
         if len(joined) + len(joiner) > MAX_REPORTS:
             text = f"the lines are more than {MAX_REPORTS} reports; give at most {MAX_REPORTS} at once"
             raise InvalidReportError((FieldProblem(path=(), message=text),))
     joined += joiner.flush()
     if not joined:
-        raise InvalidReportError((FieldProblem(path=(), message=f"no line holds {_PREFIX}; give at least one"),))
-    joined.sort(key=lambda transmission: min(number for number, _ in transmission.heard.values()))
+        empty = FieldProblem(path=(), message=f"no line holds {_PREFIX}; give at least one")
+        raise InvalidReportError(tuple(faulty[:_LISTED]) or (empty,), max(0, len(faulty) - _LISTED))
+    joined.sort(key=lambda transmission: min(line.number for line in transmission.heard.values()))
     reports: list[Adapted] = []
     for transmission in joined:
+        lines = list(transmission.heard.values())
         angles: list[tuple[Path, Angle]] = [
-            (("lines", number), ublox_angle(event, station_of(event.anchor, stations), stdev_deg=stdev_deg))
-            for number, event in transmission.heard.values()
+            (("lines", line.number), ublox_angle(line.event, station_of(line.event.anchor, stations), errors=errors))
+            for line in lines
         ]
-        skipped = [] if reports else _passed_over(others)
-        reports.append(adapted_report(list(angles), skipped, target_id=transmission.target, timestamp=None))
+        skipped = [] if reports else [*_not_valid(faulty), *_without_event(others)]
+        timestamp = _time_of(lines, latest, received)
+        reports.append(adapted_report(list(angles), skipped, target_id=transmission.target, timestamp=timestamp))
     return tuple(reports)
 
 
-def _passed_over(lines: list[int]) -> list[Skipped]:
-    """Tell of the lines that hold no event, at the first of them."""
+def _logged(before: str) -> datetime | None:
+    """Read the time that a log writes before an event, the last one where there are several."""
+    found = _TIME.findall(before)
+    if not found:
+        return None
+    try:
+        moment = datetime.fromisoformat(found[-1].replace(",", "."))
+    except ValueError:
+        return None
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+
+
+def _time_of(lines: Sequence[_Line], latest: Mapping[str, int], received: datetime | None) -> str | None:
+    """Return the time of a transmission, RFC 3339, or None where nothing says it.
+
+    Parameters
+    ----------
+    lines : sequence of _Line
+        Of the transmission.
+    latest : Mapping
+        Milliseconds since its start at which each anchor sent its last line.
+    received : datetime or None
+        When the last line came.
+    """
+    logged = [line.logged for line in lines if line.logged is not None]
+    if logged:
+        return min(logged).isoformat()
+    if received is None:
+        return None
+    # An anchor that started anew in between counts from zero again; its lines are then taken for the latest.
+    back = max(latest[line.event.anchor] - line.event.timestamp_ms for line in lines)
+    return (received - timedelta(milliseconds=max(back, 0))).isoformat()
+
+
+def _not_valid(faulty: Sequence[FieldProblem]) -> list[Skipped]:
+    """List the lines whose events are not valid; many are counted at the last one listed."""
+    skipped = [Skipped(path=problem.path, reason=f"left out: {problem.message}") for problem in faulty[:_LISTED]]
+    if more := len(faulty) - len(skipped):
+        skipped.append(
+            Skipped(path=faulty[_LISTED].path, reason=f"this and {more - 1} later lines are not valid either")
+        )
+    return skipped
+
+
+def _without_event(lines: Sequence[int]) -> list[Skipped]:
+    """Count the lines that hold no event, at the first of them."""
     if not lines:
         return []
     more = len(lines) - 1

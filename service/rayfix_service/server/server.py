@@ -133,9 +133,9 @@ def serve(
         )
         if limits != settings.connection_limits:
             _log.warning(_FEW_FILES, limits.connections, settings.connection_limits.connections)
+        at_hand.update(load_tables(path, checks=checks))  # with logging as configured: kernels may be compiled
         if not viewer_is_built():
             _log.warning(_NO_VIEWER)
-        at_hand.update(load_tables(path, checks=checks))  # with logging as configured: kernels may be compiled
         if workers == 1:
             with suppress(KeyboardInterrupt):
                 _run(config)

@@ -1,7 +1,7 @@
 """The likelihood of the position given a report, without the prior: for multiplying with a track.
 
 A fix is the product of the likelihood and of a prior, uniform over the free space. A track has a prior of its own, its
-prediction, so the fix's is divided out: else the free space, and a known height, would count anew with each report.
+prediction, so that the fix's must not count again with each report.
 """
 
 from dataclasses import dataclass
@@ -24,8 +24,7 @@ class Likelihood:
     Attributes
     ----------
     log_scale : ndarray of shape (h,)
-        Of the probability density of the report; the last is of the case that all measurements are outliers, whose
-        slope and information are zero.
+        Of the probability density of the report; the last is of the case that all measurements are outliers.
     mean : ndarray of shape (h, 3), m
     slope : ndarray of shape (h, 3), 1 / m
     information : ndarray of shape (h, 3, 3), 1 / m2
@@ -58,34 +57,41 @@ class Likelihood:
         return np.asarray(np.logaddexp.reduce(logs, axis=1))
 
 
-def likelihood_of(hypotheses: Hypotheses, prior: Prior, *, height_share: float) -> Likelihood:
-    """Divide the prior out of a report's hypotheses.
+def likelihood_of(
+    hypotheses: Hypotheses, log_volume: float, *, height: Prior | None = None, height_share: float = 0.0
+) -> Likelihood:
+    """Turn the hypotheses of a report into a likelihood.
 
     Parameters
     ----------
     hypotheses : Hypotheses
-    prior : Prior
-        That they were multiplied with.
+        Products of the measurements' likelihoods and of a prior that is uniform.
+    log_volume : float
+        Natural logarithm of the prior's volume, m3.
+    height : Prior, optional
+        What is known of the height. All reports of a target carry the same, so that no more than one of them may count
+        in full; see ``TrackingSettings.height_seconds``.
     height_share : float
-        Fraction, 0 to 1, of the known height's information that is kept. All reports of a target carry the same height,
-        so that no more than one of them may count in full; see ``TrackingSettings.height_seconds``.
+        Fraction of that knowledge that counts, 0 to 1: its Gaussian is raised to this power, and is 1 at its mean.
     """
-    taken = (1.0 - height_share) * prior.precision
     information, definite = inverses(hypotheses.cov)
     information, mean, log_weight = information[definite], hypotheses.mean[definite], hypotheses.log_weight[definite]
-    log_scale = log_weight + 0.5 * np.linalg.slogdet(information)[1] - 1.5 * LOG_2PI + prior.log_volume
-    information[:, 2, 2] -= taken
+    log_scale = log_weight + 0.5 * np.linalg.slogdet(information)[1] - 1.5 * LOG_2PI + log_volume
+    log_scale = np.append(log_scale, hypotheses.log_all_outlier)
+    mean = np.concatenate([mean, np.zeros((1, 3))])
+    information = np.concatenate([information, np.zeros((1, 3, 3))])
     slope = np.zeros_like(mean)
-    if prior.precision > 0.0:
-        known = prior.eta / prior.precision
-        from_known = mean[:, 2] - known
-        # Only what is left of the height lowers the likelihood, and where the height is right it does not.
-        log_scale += 0.5 * taken * from_known**2 - 0.5 * prior.eta * known
-        slope[:, 2] = taken * from_known
+    if height is not None and height.precision > 0.0:
+        kept, known = height_share * height.precision, height.eta / height.precision
+        mean[-1, 2] = known
+        off = mean[:, 2] - known
+        log_scale -= 0.5 * kept * off**2
+        slope[:, 2] = -kept * off
+        information[:, 2, 2] += kept
     return Likelihood(
-        log_scale=np.append(log_scale, hypotheses.log_all_outlier),
-        mean=np.concatenate([mean, np.zeros((1, 3))]),
-        slope=np.concatenate([slope, np.zeros((1, 3))]),
-        information=np.concatenate([information, np.zeros((1, 3, 3))]),
-        dropped=len(definite) - len(mean),
+        log_scale=log_scale,
+        mean=mean,
+        slope=slope,
+        information=information,
+        dropped=len(definite) - int(np.count_nonzero(definite)),
     )

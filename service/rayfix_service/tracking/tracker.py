@@ -81,12 +81,14 @@ class Tracker:
         self._walls = walls_of(scene.in_table_frame)
         self._origin = scene.origin
         self.dropped = 0
+        self._log_volume = uniform_prior(self._walls.free_space).log_volume
         self._clock = clock
         self._tracks: OrderedDict[str, _Track] = OrderedDict()  # the one with the latest report comes last
         self._lock = Lock()
 
-    def __len__(self) -> int:
-        """Return the number of targets."""
+    @property
+    def num_targets(self) -> int:
+        """Number of targets that are followed."""
         return len(self._tracks)
 
     def warm_up(self) -> None:
@@ -105,7 +107,7 @@ class Tracker:
         )
         particles = birth(hypotheses, free_space, settings.motion, 64, rng)
         assert particles is not None
-        likelihood = likelihood_of(hypotheses, uniform_prior(free_space), height_share=1.0)
+        likelihood = likelihood_of(hypotheses, self._log_volume)
         updated = update(particles, likelihood, settings.motion, 0.1, self._walls, rng)
         position = _tracked("started", "1970-01-01T00:00:00Z", 1, particles if updated is None else updated.particles)
         position.regions.upright_ellipsoid(0.5)
@@ -128,8 +130,12 @@ class Tracker:
         if name is None or timestamp is None:
             key = "target_id" if name is None else "timestamp"
             raise ReportError(f"{key} is missing; a target is followed by its target_id and timestamp", path=(key,))
-        if fused.hypotheses is not None:
-            fused = replace(fused, hypotheses=fused.hypotheses.best(_MOST_HYPOTHESES))
+        if fused.hypotheses is not None and fused.likelihood is not None:
+            fused = replace(
+                fused,
+                hypotheses=fused.hypotheses.best(_MOST_HYPOTHESES),
+                likelihood=fused.likelihood.best(_MOST_HYPOTHESES),
+            )
         with self._lock:
             now = self._clock()
             self._forget(now)
@@ -206,10 +212,12 @@ class Tracker:
         self, particles: Particles | None, fused: Fused, step: float, height_share: float, rng: np.random.Generator
     ) -> tuple[Particles | None, TrackState]:
         """Update particles, those that could have moved at all, with a report, or begin anew with it."""
-        assert fused.hypotheses is not None
+        assert fused.likelihood is not None
         updated = None
         if particles is not None:
-            likelihood = likelihood_of(fused.hypotheses, fused.prior, height_share=height_share)
+            likelihood = likelihood_of(
+                fused.likelihood, self._log_volume, height=fused.prior, height_share=height_share
+            )
             updated = update(particles, likelihood, self.settings.motion, step, self._walls, rng)
         if updated is None:
             return self._newborn(fused, rng), "restarted"

@@ -38,14 +38,16 @@ def test_every_format_has_an_example():
 def test_an_input_is_located(name: str, locator: Locator):
     (adapted,) = parse(INPUTS[name].encode(), cast("InputFormat", name))
     fix = locator.locate(adapted.report)
-    # u-blox anchors tell no uncertainty: with the one that is taken, mirror images remain, one of them more probable.
-    assert fix.status == ("ambiguous" if name == "ublox" else "ok")
+    assert fix.status == "ok"
     assert all(outcome.used for outcome in fix.outcomes)
     assert adapted.skipped == ()
     # Their noise is one of about a degree at up to 9 m, or with u-blox half a degree of rounding.
-    near = [c for c in fix.candidates if c.position == pytest.approx([7.0, 4.0, 1.5], abs=0.5)]
+    # The wide errors that are assumed of u-blox anchors reach beyond the walls, which pulls the mean inwards.
+    near = [
+        c for c in fix.candidates if c.position == pytest.approx([7.0, 4.0, 1.5], abs=1.0 if name == "ublox" else 0.5)
+    ]
     assert near
-    assert near[0].probability > (0.25 if name == "ublox" else 0.7)
+    assert near[0].probability > 0.7
 
 
 def test_the_payload_for_a_broker_is_an_angle():

@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rayfix_service.adapters.formats import InputFormat, parse, write
+from rayfix_service.adapters.ublox import AngleErrors
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
@@ -47,7 +48,7 @@ def sight(locator: Locator) -> dict[str, tuple[float, float, float]]:
 
 def locate(locator: Locator, document: Any, input_format: InputFormat) -> Fix:
     body = document if isinstance(document, str) else json.dumps(document)
-    (adapted,) = parse(body.encode(), input_format)
+    (adapted,) = parse(body.encode(), input_format, errors=AngleErrors(stdev_deg=5.0, tail_share=0.0, tail_scale=1.0))
     fix = locator.locate(adapted.report)
     assert fix.status in ("ok", "ambiguous")
     assert all(outcome.used for outcome in fix.outcomes)

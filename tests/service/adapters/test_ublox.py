@@ -1,14 +1,16 @@
 """u-blox lines: real samples, the manual's fields, joining, refusals."""
 
 import math
+from datetime import UTC, datetime
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rayfix_service.adapters.ublox import UudfEvent, parse_ublox, parse_uudf
-from rayfix_service.fusion.measurements.report import Angle
+from rayfix_service.adapters.ublox import AngleErrors, UudfEvent, parse_ublox, parse_uudf
+from rayfix_service.fusion.measurements.report import Angle, ErrorModel
 from rayfix_service.wire import InvalidReportError
+from rayfix_tables.errors import SettingsError
 from tests.support.checkout import SHARED
 
 NINE = '+UUDF:6C1DEBA5F60C,-53,8,2,0,37,"6C1DEBA09862","",1437347'
@@ -65,7 +67,8 @@ def test_right_of_the_boresight_is_a_negative_azimuth(azimuth: int, elevation: i
     assert angle.zenith is not None
     assert math.degrees(-angle.azimuth) == pytest.approx(azimuth, abs=1e-9)
     assert 90 - math.degrees(angle.zenith) == pytest.approx(elevation, abs=1e-9)
-    assert (angle.azimuth_stdev, angle.zenith_stdev) == (math.radians(5), math.radians(5))
+    assert (angle.azimuth_stdev, angle.zenith_stdev) == (math.radians(10), math.radians(10))
+    assert angle.error_model == ErrorModel(tail_share=0.2, tail_scale=3.0)
 
 
 def stations(text: str) -> list[tuple[str | None, list[str], list[int]]]:
@@ -152,3 +155,62 @@ def test_events_in_a_log_are_found_in_their_lines():
         (("lines", 0), "this line and 2 more lines hold no +UUDF:")
     ]
     assert [adapted.skipped for adapted in (*found[1:], *expected)] == [()] * 3
+
+
+def test_errors_of_angles_can_be_set():
+    errors = AngleErrors(stdev_deg=4.0, tail_share=0.0, tail_scale=1.0)
+    (adapted,) = parse_ublox(line("t", "a"), errors=errors)
+    (angle,) = adapted.report.measurements
+    assert isinstance(angle, Angle)
+    assert (angle.azimuth_stdev, angle.error_model) == (math.radians(4), ErrorModel())
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"stdev_deg": 0.0}, {"stdev_deg": math.nan}, {"tail_share": 1.0}, {"tail_scale": 0.5}]
+)
+def test_errors_out_of_range_are_refused(wrong: dict[str, float]):
+    with pytest.raises(SettingsError, match=next(iter(wrong))):
+        AngleErrors(**wrong)
+
+
+def test_a_line_that_is_not_valid_costs_itself():
+    text = "\n".join([line("t", "a", 1), "+UUDF:cut off", line("t", "b", 1), NINE.replace(",8,", ",91,"), "+STARTUP"])
+    first, *more = parse_ublox(text)
+    assert [m.station_id for m in first.report.measurements] == ["a", "b"]
+    assert not more
+    assert [(skip.path, skip.reason) for skip in first.skipped] == [
+        (("lines", 1), "left out: line 2 has 1 fields; give 9, or 10 with the sequence number"),
+        (("lines", 3), "left out: line 4 has angle_azimuth '91'; give an integer from -90 to 90"),
+        (("lines", 4), "this line holds no +UUDF:"),
+    ]
+
+
+def test_many_lines_that_are_not_valid_are_counted():
+    (adapted,) = parse_ublox("\n".join(["+UUDF:cut off"] * 50 + [line("t", "a")]))
+    assert [skip.path[1] for skip in adapted.skipped] == list(range(21))
+    assert adapted.skipped[-1].reason == "this and 29 later lines are not valid either"
+    with pytest.raises(InvalidReportError) as refused:
+        parse_ublox("\n".join(["+UUDF:cut off"] * 50))
+    assert (len(refused.value.problems), refused.value.more) == (20, 30)
+
+
+def timestamps(text: str, received: datetime | None = None) -> list[str | None]:
+    return [adapted.report.timestamp for adapted in parse_ublox(text, received=received)]
+
+
+def test_the_time_of_a_log_is_that_of_the_report():
+    assert timestamps(f"2026-11-30 10:00:00,250 rx {line('t', 'a', 1)}") == ["2026-11-30T10:00:00.250000+00:00"]
+    assert timestamps(f"[2026-11-30T10:00:00+01:00] {line('t', 'a', 1)}") == ["2026-11-30T10:00:00+01:00"]
+    both = f"2026-11-30T10:00:02Z {line('t', 'a', 1)}\n2026-11-30T10:00:01Z {line('t', 'b', 1)}"
+    assert timestamps(both) == ["2026-11-30T10:00:01+00:00"]
+    assert timestamps(f"2026-99-30 10:00:00 {line('t', 'a', 1)}\n12:00 {line('t', 'a', 2)}") == [None, None]
+
+
+def test_without_a_log_times_are_counted_back_from_the_receipt_by_the_anchors_clocks():
+    """The clocks of the anchors differ; the last line of each came now."""
+    sent = [("a", 1, 1000), ("b", 1, 500_020), ("a", 2, 1100), ("b", 2, 500_120), ("a", 3, 1250)]
+    text = "\n".join(line("t", anchor, number).replace("1437347", str(ms)) for anchor, number, ms in sent)
+    now = datetime(2026, 11, 30, 10, 0, 1, tzinfo=UTC)
+    times = [datetime.fromisoformat(str(time)) for time in timestamps(text, now)]
+    assert [round((now - time).total_seconds(), 6) for time in times] == [0.25, 0.15, 0.0]
+    assert timestamps(text) == [None, None, None]

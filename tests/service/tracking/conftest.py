@@ -78,7 +78,7 @@ def fused_of(
         target_id=target,
         timestamp=timestamp,
     )
-    return Fused(fix=fix, hypotheses=hypotheses, prior=prior or uniform_prior(FREE))
+    return Fused(fix=fix, hypotheses=hypotheses, prior=prior or uniform_prior(FREE), likelihood=hypotheses)
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ def make_hypotheses() -> Callable[..., Hypotheses]:
 @pytest.fixture
 def even_likelihood() -> Callable[..., Likelihood]:
     """Return the function that makes likelihoods from what :func:`hypotheses_of` takes."""
-    return lambda *a: likelihood_of(hypotheses_of(*a), uniform_prior(FREE), height_share=0.0)
+    return lambda *a: likelihood_of(hypotheses_of(*a), uniform_prior(FREE).log_volume)
 
 
 @pytest.fixture

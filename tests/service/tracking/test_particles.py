@@ -87,7 +87,7 @@ def test_a_report_of_outliers_alone_leaves_the_prediction(
     far = make_hypotheses([[25.0, 25.0, 25.0]], 0.1, log_all_outlier=-4.0)
     found = update(
         particles,
-        likelihood_of(far, uniform_prior(free_space), height_share=0.0),
+        likelihood_of(far, uniform_prior(free_space).log_volume),
         MODEL,
         0.5,
         walls_of(open_scene),
@@ -106,10 +106,10 @@ def test_the_known_height_counts_as_its_share(
     particles = cloud(rng, [0.0, 0.0, 1.0], [0.0, 0.0, 0.0])
     prior: Prior = height_prior(Height(z=1.2, stdev=0.3), free_space)
     hypotheses = make_hypotheses([[0.0, 0.0, 1.2]], 0.3, log_all_outlier=-60.0)
-    hypotheses.cov[:] = np.diag([1e6, 1e6, 0.3**2])  # as wide as nothing, but for the height
+    hypotheses.cov[:] = np.diag([1e6, 1e6, 1e6])  # as wide as nothing
     t = 0.5
     for share in (0.0, 1.0):
-        likelihood = likelihood_of(hypotheses, prior, height_share=share)
+        likelihood = likelihood_of(hypotheses, 0.0, height=prior, height_share=share)
         found = update(particles, likelihood, MODEL, t, walls_of(open_scene), rng)
         assert found is not None
         variance = 0.2**2 + t**2 * 0.1 + 0.5 * t**3 / 3
@@ -221,7 +221,7 @@ def test_an_update_leaves_out_hypotheses_without_a_covariance(
     prior, particles = uniform_prior(free_space), cloud(rng, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 
     def updated(report: Hypotheses) -> Updated:
-        likelihood = likelihood_of(report, prior, height_share=0.0)
+        likelihood = likelihood_of(report, prior.log_volume)
         found = update(particles, likelihood, MODEL, 0.5, walls_of(open_scene), np.random.default_rng(7))
         assert found is not None
         return found

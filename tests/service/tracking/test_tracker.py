@@ -172,14 +172,14 @@ def test_targets_not_heard_of_are_forgotten(send: Send, tracker: Tracker, clock:
     clock.now = 10.0
     assert send(0.5, [[0.0, 0.0, 1.0]], target="a").num_reports == 2
     send(0.0, [[0.0, 0.0, 1.0]], target="d")  # the fourth: b has not been heard of for longest
-    assert len(tracker) == 3
+    assert tracker.num_targets == 3
     assert send(0.5, [[0.0, 0.0, 1.0]], target="c").num_reports == 2
     assert send(0.5, [[0.0, 0.0, 1.0]], target="b").num_reports == 1
     clock.now = 69.9
     send(1.0, [[0.0, 0.0, 1.0]], target="c")
     clock.now = 70.1  # a is gone since c came, d and b have just passed 60 s
     send(1.5, [[0.0, 0.0, 1.0]], target="c")
-    assert len(tracker) == 1
+    assert tracker.num_targets == 1
 
 
 def test_tracks_depend_on_nothing_but_their_reports(
@@ -253,7 +253,7 @@ def test_whatever_comes_in_whatever_order_a_track_is_sound(
         moment = datetime(2026, 1, 31, 10, tzinfo=UTC) + timedelta(seconds=seconds)
         hypotheses = None if places is None else make_hypotheses(places, stdev, None, log_all_outlier)
         track = tracker.follow(make_fused(hypotheses, target=target, timestamp=moment.isoformat()))
-        assert len(tracker) <= 3
+        assert tracker.num_targets <= 3
         if track is None:
             assert places is None or target not in latest
             continue

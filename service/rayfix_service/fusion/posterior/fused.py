@@ -9,10 +9,11 @@ from rayfix_service.fusion.product.prior import Prior
 
 @dataclass(frozen=True, kw_only=True)
 class Fused:
-    """A fix, and the likelihood that it comes from.
+    """A fix, its posterior, and the likelihood for filters that have a prior of their own.
 
-    The probability density of the report at a position x is ``sum_h exp(log_weight_h) N(x; mean_h, cov_h) / prior(x)``,
-    and ``exp(log_all_outlier)`` besides for the case that all measurements are outliers.
+    The probability density of the report at a position x is ``V sum_h exp(log_weight_h) N(x; mean_h, cov_h)`` with the
+    volume V of the free space and the Gaussians of ``likelihood``, and ``exp(log_all_outlier)`` besides for the case
+    that all measurements are outliers.
 
     Attributes
     ----------
@@ -22,8 +23,12 @@ class Fused:
         as the prior.
     prior : Prior
         Of the position, with which the hypotheses' Gaussians are multiplied.
+    likelihood : Hypotheses or None
+        The same without what is known of the height: from a product with a uniform prior of its own, since dividing the
+        height out of merged hypotheses leaves precisions that are not positive.
     """
 
     fix: Fix
     hypotheses: Hypotheses | None
     prior: Prior
+    likelihood: Hypotheses | None

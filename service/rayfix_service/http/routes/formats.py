@@ -1,5 +1,6 @@
 """Routes that locate from messages of other systems; docs/formats.md describes them."""
 
+from datetime import UTC, datetime
 from functools import partial
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from rayfix_service.adapters.formats import parse
 from rayfix_service.adapters.nrppa import parse_nrppa
 from rayfix_service.adapters.nrppa_documents import NrppaBatchDocument, NrppaDocument
 from rayfix_service.adapters.silabs import SilabsBatchDocument, SilabsDocument, parse_silabs
+from rayfix_service.adapters.ublox import USUAL_ERRORS, AngleErrors
 from rayfix_service.http.access.guard import charge_reports
 from rayfix_service.http.answering.cooperative import Cooperation
 from rayfix_service.http.answering.locating import Incoming, foreign
@@ -141,10 +143,30 @@ async def post_ublox(
         float | None,
         Query(description="probability with which accuracies are to hold, 0.01 to 0.99; 0.68 unless given"),
     ] = None,
+    stdev_deg: Annotated[
+        float, Query(ge=1e-3, le=180, description="standard deviation of the anchors' angles, deg")
+    ] = USUAL_ERRORS.stdev_deg,
+    tail_share: Annotated[
+        float, Query(ge=0, lt=1, description="probability that an angle's error is of a wider Gaussian")
+    ] = USUAL_ERRORS.tail_share,
+    tail_scale: Annotated[
+        float, Query(ge=1, le=100, description="standard deviation of the wider Gaussian, in those of the other")
+    ] = USUAL_ERRORS.tail_scale,
 ) -> JsonAnswer:
-    """Take ``+UUDF`` lines of u-blox anchors, join them by tag and sequence number, and locate each transmission."""
+    """Take ``+UUDF`` lines of u-blox anchors, join them by tag and sequence number, and locate each transmission.
+
+    Lines without a log's time are taken for lines that end now.
+    """
     known, results = known_height(height_m, height_stdev_m), list[bytes]()
-    read = partial(parse, input_format="ublox", stations=station_map(station), height=known, confidence=confidence)
+    read = partial(
+        parse,
+        input_format="ublox",
+        stations=station_map(station),
+        height=known,
+        confidence=confidence,
+        errors=AngleErrors(stdev_deg=stdev_deg, tail_share=tail_share, tail_scale=tail_scale),
+        received=datetime.now(UTC),
+    )
     messages = await answerer.read(read, body)
     charge_reports(request, len(messages))
     cooperation = Cooperation(request)
