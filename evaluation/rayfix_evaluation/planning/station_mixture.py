@@ -7,7 +7,7 @@ all cells times their solid angles is the sum of pi: 1 where the position is aud
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -70,35 +70,107 @@ def audible_paths(level: Level, places: Array) -> AudiblePaths:
     """
     order = np.argsort(places[:, 0], kind="stable")
     ordered = np.ascontiguousarray(places[order])
-    density = np.zeros(len(places))
-    cell = np.full(len(places), -1, np.int64)
-    total = np.zeros(len(places))
-    u, u_mean = np.zeros((len(places), 3)), np.zeros((len(places), 3))
-    jacobian = np.zeros((len(places), 3, 3))
+    found = _Found.nothing(len(places))
     solid_angle = np.repeat(level.grid.solid_angles, level.grid.ring_cells)
     log_mass = np.asarray(level.cell_log_mass, np.float64)
     for first, last in level.ranges(_CHUNK):
         begin, end = int(level.cell_offsets[first]), int(level.cell_offsets[last])
-        part = level.mixture[begin:end]
-        _search(
-            first,
-            np.asarray(level.cell_offsets[first : last + 1], np.int64) - begin,
-            log_mass,
-            solid_angle,
+        cells = _Cells(
+            first=first,
+            offsets=np.asarray(level.cell_offsets[first : last + 1], np.int64) - begin,
+            log_mass=log_mass,
+            solid_angle=solid_angle,
+        )
+        _search(cells, _Components.of(level.mixture[begin:end]), ordered, found)
+    back = np.argsort(order, kind="stable")
+    return _as_paths(level, _Found._make(array[back] for array in found))
+
+
+class _Cells(NamedTuple):
+    """Cells of a level.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first one.
+    offsets : ndarray of int64, shape (n_cells + 1,)
+        Components of each.
+    log_mass, solid_angle : ndarray
+        Of all cells of the level.
+    """
+
+    first: int
+    offsets: NDArray[np.int64]
+    log_mass: Array
+    solid_angle: Array
+
+
+class _Components(NamedTuple):
+    """Components as Gaussians over the position, and their ray coordinates.
+
+    Attributes
+    ----------
+    log_height : ndarray of shape (k,)
+        Log density at the mean.
+    mean, deviation : ndarray of shape (k, 3), m
+    precision : ndarray of shape (k, 3, 3), 1 / m2
+    u_mean : ndarray of shape (k, 3)
+    u_cov, jacobian : ndarray of shape (k, 3, 3)
+    """
+
+    log_height: Array
+    mean: Array
+    deviation: Array
+    precision: Array
+    u_mean: Array
+    u_cov: Array
+    jacobian: Array
+
+    @classmethod
+    def of(cls, part: TubeMixture) -> "_Components":
+        """Return the components of a mixture."""
+        return cls(
             *_as_gaussians(part),
             np.asarray(part.u_mean, np.float64),
             unpack(np.asarray(part.u_cov, np.float64)),
             np.asarray(part.jacobian, np.float64),
-            ordered,
-            density,
-            cell,
-            total,
-            u,
-            u_mean,
-            jacobian,
         )
-    back = np.argsort(order, kind="stable")
-    return _as_paths(level, cell[back], total[back], u[back], u_mean[back], jacobian[back])
+
+
+class _Found(NamedTuple):
+    """The cell of the largest density at each position so far, which the search updates.
+
+    Attributes
+    ----------
+    density : ndarray of shape (n,)
+    cell : ndarray of int64, shape (n,)
+        -1 where there is none.
+    total : ndarray of shape (n,)
+        Sum over all cells of the density times the solid angle.
+    u, u_mean : ndarray of shape (n, 3)
+        Ray coordinates of the position and mean of the cell's densest component there.
+    jacobian : ndarray of shape (n, 3, 3)
+        Of that component.
+    """
+
+    density: Array
+    cell: NDArray[np.int64]
+    total: Array
+    u: Array
+    u_mean: Array
+    jacobian: Array
+
+    @classmethod
+    def nothing(cls, count: int) -> "_Found":
+        """Return that nothing is known of so many positions."""
+        return cls(
+            np.zeros(count),
+            np.full(count, -1, np.int64),
+            np.zeros(count),
+            np.zeros((count, 3)),
+            np.zeros((count, 3)),
+            np.zeros((count, 3, 3)),
+        )
 
 
 def _as_gaussians(part: TubeMixture) -> tuple[Array, Array, Array, Array]:
@@ -110,39 +182,20 @@ def _as_gaussians(part: TubeMixture) -> tuple[Array, Array, Array, Array]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(
-    first: Any,
-    offsets: Any,
-    log_mass: Any,
-    solid_angle: Any,
-    log_height: Any,
-    mean: Any,
-    deviation: Any,
-    precision: Any,
-    u_mean: Any,
-    u_cov: Any,
-    jacobian: Any,
-    places: Any,
-    best_density: Any,
-    best_cell: Any,
-    total: Any,
-    best_u: Any,
-    best_mean: Any,
-    best_jacobian: Any,
-) -> None:
-    """Density of each cell at the places in its reach; the best one is kept with its densest component there.
+def _search(cells: Any, components: Any, places: Any, found: Any) -> None:
+    """Compute the density of each cell at the positions in its reach, and keep the largest in ``found``.
 
     Parameters
     ----------
-    first : int
-        Number of the first cell.
-    offsets : ndarray of int64, shape (n_cells + 1,)
-        Components of the cells.
+    cells : _Cells
+    components : _Components
     places : ndarray of shape (n, 3), m
         By ascending x.
-    best_density, best_cell, total, best_u, best_mean, best_jacobian : ndarray
-        What is known of each place so far, which is updated.
+    found : _Found
     """
+    first, offsets, log_mass, solid_angle = cells
+    log_height, mean, deviation, precision, u_mean, u_cov, jacobian = components
+    best_density, best_cell, total, best_u, best_mean, best_jacobian = found
     count = len(places)
     density, densest, member = np.zeros(count), np.zeros(count), np.zeros(count, np.int64)
     touched = np.empty(count, np.int64)
@@ -199,10 +252,9 @@ def _search(
             densest[n] = 0.0
 
 
-def _as_paths(
-    level: Level, cell: NDArray[np.int64], total: Array, u: Array, u_mean: Array, jacobian: Array
-) -> AudiblePaths:
+def _as_paths(level: Level, best: _Found) -> AudiblePaths:
     """Turn tangent coordinates into angles, and tubes into gradients."""
+    cell, u, u_mean, jacobian = best.cell, best.u, best.u_mean, best.jacobian
     found = cell >= 0
     centres = level.grid.centres[cell[found]]
     azimuth, zenith = _angles(u[found], centres)
@@ -214,7 +266,7 @@ def _as_paths(
     turn = mirror @ _frame(azimuth, zenith)
     gradients = np.zeros((len(cell), 3, 3))
     gradients[found] = turn.transpose(0, 2, 1) / _scale(length)[:, :, None]
-    return AudiblePaths(probability=total, gradients=gradients, **predicted)
+    return AudiblePaths(probability=best.total, gradients=gradients, **predicted)
 
 
 def _angles(u: Array, centres: Array) -> tuple[Array, Array]:
