@@ -2,8 +2,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: reference mountings client coverage viewer viewer-test browser screenshots demo lock test test-kernels test-portable \
-	test-lowest test-lowest-quick test-newest lint types package audit bom images accuracy openapi clean
+.PHONY: docs reference mountings client coverage viewer viewer-test browser screenshots demo lock test test-kernels \
+	test-portable test-lowest test-lowest-quick test-newest lint types package audit bom images accuracy openapi clean
 
 # pip takes what builds the package from these too: under the first name until 25.2, under the second from 25.3 on.
 PINNED := PIP_CONSTRAINT=$(CURDIR)/constraints.txt PIP_BUILD_CONSTRAINT=$(CURDIR)/constraints.txt
@@ -41,6 +41,16 @@ viewer-test:
 # The documentation's pages of the site file and of the command line, from the code.
 reference: $(VENV)/.done
 	$(BIN)/python tools/generate_reference.py
+
+# The documentation as a site, in site/. It reads the code and imports none of it: an environment of its own suffices.
+$(VENV)/.docs: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --group docs
+	touch $@
+
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
 
 # The documentation's drawings of how arrays are mounted.
 mountings: $(VENV)/.done
@@ -141,4 +151,4 @@ openapi: $(VENV)/.done
 	$(BIN)/python -m rayfix_service.server.openapi > docs/openapi.json
 
 clean:
-	rm -rf $(VENV) .venv-lowest .venv-newest dist demo browser-artefacts $(dir $(VIEWER)) $(FRONTEND)/node_modules .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-lowest .venv-newest dist site demo browser-artefacts $(dir $(VIEWER)) $(FRONTEND)/node_modules .pytest_cache .mypy_cache .ruff_cache

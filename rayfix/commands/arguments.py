@@ -85,11 +85,11 @@ def web_origin(text: str) -> str:
 
 
 def web_prefix(text: str) -> str:
-    """Read the path below which a proxy offers the service."""
+    """Read the path below which a proxy offers the service; empty, as ``/`` is, for none."""
     from rayfix_service.http.access.prefix import is_prefix
 
     prefix = text.rstrip("/")
-    if not is_prefix(prefix):
+    if prefix and not is_prefix(prefix):  # argparse also reads the default, which is empty
         raise argparse.ArgumentTypeError(f"{text!r} is no path of plain segments; give e.g. /rayfix")
     return prefix
 

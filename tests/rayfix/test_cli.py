@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rayfix.cli import main
+from rayfix.cli import main, make_parser
 from rayfix.console import print_fix
 from rayfix.example.drop import EXAMPLE_POSITION
 from rayfix.example.files import write_example
@@ -340,3 +340,8 @@ def test_an_inconsistent_fix_is_shown_without_probabilities(capsys: pytest.Captu
     assert out.splitlines()[0] == "inconsistent: (1.00, 2.00, 3.00) m is only the best guess"
     assert "the angle of station 'bs1'" in out
     assert "%" not in out
+
+
+@pytest.mark.parametrize(("given", "prefix"), [([], ""), (["--root-path", "/"], ""), (["--root-path", "/a/"], "/a")])
+def test_a_service_needs_no_prefix(given: list[str], prefix: str) -> None:
+    assert make_parser().parse_args(["serve", "T.h5", *given]).root_path == prefix
