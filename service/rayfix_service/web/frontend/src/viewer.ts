@@ -93,7 +93,14 @@ export class Viewer {
     replace(layout.left, this.viewPanel.element, list.element);
     layout.site.textContent = site.table.site.name;
     document.title = `rayfix · ${site.table.site.name}`;
-    drawLegend(layout.legend, site.settings.max_reflections);
+    let hadTracks = false;
+    const legend = drawLegend(layout.legend, site.settings.max_reflections, () => this.store.hasTracks);
+    this.store.onFix(() => {
+      if (this.store.hasTracks === hadTracks) return;
+      hadTracks = this.store.hasTracks;
+      legend();
+      this.inset();
+    });
 
     layout.buttons.simulate.hidden = !site.settings.simulation;
     layout.buttons.paste.hidden = api === null;
@@ -199,7 +206,8 @@ export class Viewer {
   }
 
   private describe(): void {
-    this.fixPanel.show(this.store.selected?.latest ?? null, this.explained);
+    const { selected } = this.store;
+    this.fixPanel.show(selected?.latest ?? null, this.explained, selected?.track ?? null);
   }
 
   private async loadPosterior(event: FixEvent): Promise<void> {
@@ -306,11 +314,11 @@ export class Viewer {
     const { clientWidth, clientHeight } = this.layout.canvas;
     let best: { id: string; apart: number } | null = null;
     for (const target of this.store.targets.values()) {
-      const at = target.trail[target.trail.length - 1];
-      if (at === undefined) continue;
-      const p = this.stage.local(at).project(this.stage.camera);
-      const apart = Math.hypot(((p.x + 1) / 2) * clientWidth - x, ((1 - p.y) / 2) * clientHeight - y);
-      if (apart < NEAR && (best === null || apart < best.apart)) best = { id: target.id, apart };
+      for (const at of this.targets.positionsOf(target)) {
+        const p = this.stage.local(at).project(this.stage.camera);
+        const apart = Math.hypot(((p.x + 1) / 2) * clientWidth - x, ((1 - p.y) / 2) * clientHeight - y);
+        if (apart < NEAR && (best === null || apart < best.apart)) best = { id: target.id, apart };
+      }
     }
     if (best !== null) this.store.select(best.id);
   }
