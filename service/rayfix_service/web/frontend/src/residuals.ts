@@ -81,7 +81,7 @@ export function sceneAngles(
   return anglesOf(multiply(localToScene(station.orientation), direction(azimuth, zenith)));
 }
 
-/** The same backwards: angles in the frame of a measurement, of a direction in the scene frame; rad. */
+/** Angles in the frame of a measurement, of a direction in the scene frame; rad. */
 export function measuredAngles(
   m: Measurement,
   station: StationInfo,
@@ -90,7 +90,6 @@ export function measuredAngles(
 ): { azimuth: number; zenith: number } {
   if (m.frame === "north") return { azimuth: wrap(scene.azimuth - north), zenith: scene.zenith };
   if (m.frame !== "lcs") return scene;
-  if (m.zenith_deg == null) return { azimuth: wrap(scene.azimuth - station.orientation.bearing_deg * DEG), zenith: scene.zenith };
   return anglesOf(multiply(transpose(localToScene(station.orientation)), direction(scene.azimuth, scene.zenith)));
 }
 

@@ -23,6 +23,7 @@ import { Inspector } from "./ui/inspector";
 import { installKeys } from "./ui/keyboard";
 import type { Layout, Mode } from "./ui/layout";
 import { drawLegend } from "./ui/legend";
+import { Rulers } from "./ui/rulers";
 import { Simulator } from "./ui/simulator";
 import { Notices } from "./ui/status";
 import { TargetList } from "./ui/targetlist";
@@ -30,6 +31,7 @@ import { ViewPanel } from "./ui/viewpanel";
 
 const CLICK = 5; // px that a click may move
 const NEAR = 16; // px from a target that still mean it
+const LEAST_WIDTH = 240; // px of the drawing beside an open panel that legend and rulers need
 const LEAST_BETWEEN = 1000; // ms between posteriors of a stream
 
 const STREAM_TEXT: Record<StreamState, string> = {
@@ -102,6 +104,10 @@ export class Viewer {
       this.inset();
     });
 
+    const rulers = new Rulers(stage, layout.canvas, () => layout.insets(), site.table.site.north_deg);
+    layout.labels.before(rulers.element);
+
+    layout.docs.hidden = api === null;
     layout.buttons.simulate.hidden = !site.settings.simulation;
     layout.buttons.paste.hidden = api === null;
     layout.tabs.table.hidden = api === null;
@@ -231,6 +237,8 @@ export class Viewer {
 
   /** Tell the drawing, and what lies over it, how much the panels cover. */
   private inset(): void {
+    const { left, right } = this.layout.insets();
+    this.layout.stage.classList.toggle("covered", this.layout.stage.clientWidth - left - right < LEAST_WIDTH);
     const insets = this.layout.insets();
     this.stage.setInsets(insets);
     this.layout.stage.style.setProperty("--left", `${insets.left}px`);

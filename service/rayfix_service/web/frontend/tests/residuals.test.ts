@@ -40,11 +40,12 @@ describe("angles in the frame of a measurement", () => {
     }
   });
 
-  test("without a zenith turn by the bearing alone", () => {
-    const m: Measurement = { type: "aoa", station_id: "bs1", frame: "lcs", azimuth_deg: 10 };
-    const scene = sceneAngles(m, station(STATION), 0);
-    expect(scene.azimuth).toBeCloseTo(50 * DEG, 12);
-    expect(measuredAngles(m, station(STATION), 0, { azimuth: scene.azimuth, zenith: 1 }).azimuth).toBeCloseTo(10 * DEG, 12);
+  test("of a tilted station are those of its own frame, also where only the azimuth was measured", () => {
+    const whole: Measurement = { type: "aoa", station_id: "bs1", frame: "lcs", azimuth_deg: 60, zenith_deg: 120 };
+    const scene = sceneAngles(whole, station(STATION), 0);
+    const alone: Measurement = { type: "aoa", station_id: "bs1", frame: "lcs", azimuth_deg: 60 };
+    const found = measuredAngles(alone, station(STATION), 0, { azimuth: scene.azimuth, zenith: scene.zenith! });
+    expect(found.azimuth).toBeCloseTo(60 * DEG, 9);
   });
 });
 
