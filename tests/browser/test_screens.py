@@ -1,4 +1,4 @@
-"""What a screen has room for, from a phone to a desk, dark and light; and what measures a view from above or the side."""
+"""What a screen has room for, from a phone to a desk, dark and light; and what measures views along an axis."""
 
 import json
 import re

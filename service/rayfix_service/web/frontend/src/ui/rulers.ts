@@ -80,7 +80,7 @@ export class Rulers {
     };
     const parts = [line(free.left, free.bottom, free.right, free.bottom), line(free.left, free.top, free.left, free.bottom)];
     // The ends are the names' own.
-    for (const tick of ticks(this.across!, free.left + 24, free.right - 36, APART.across)) {
+    for (const tick of ticks(this.across!, free.left + 24, free.right - 64, APART.across)) {
       parts.push(line(tick.pixel, free.bottom, tick.pixel, free.bottom - TICK));
       parts.push(text(tick.pixel, free.bottom + LABEL - 2, tick.text, { "text-anchor": "middle" }));
     }
