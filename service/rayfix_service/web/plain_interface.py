@@ -8,6 +8,7 @@ _PAGE = """\
 <!doctype html>
 <html lang="en">
 <meta charset="utf-8">
+<meta name="color-scheme" content="light dark">
 <title>rayfix: HTTP interface</title>
 <h1>HTTP interface</h1>
 <p>This installation is without the interactive page. <a href="openapi.json">The OpenAPI document</a> has all of this.

@@ -19,6 +19,7 @@ _NOT_BUILT = """\
 <!doctype html>
 <html lang="en">
 <meta charset="utf-8">
+<meta name="color-scheme" content="light dark">
 <title>rayfix</title>
 <h1>rayfix</h1>
 <p>The service runs, but this installation is without the viewer, as there was no Node.js 20.19 or later when it was

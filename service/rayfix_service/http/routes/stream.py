@@ -64,7 +64,8 @@ class EventStreamResponse(StreamingResponse):
     responses={
         200: {
             "description": "Server-sent events until the client leaves. Each event `fix` has a count as its `id` and "
-            "an object with `table`, `report` and `fix` as its data. A listener that reads too slowly loses the oldest "
+            "an object with `table`, `report` and `fix` as its data; `fix` has the `track` of a target that is "
+            "followed. A listener that reads too slowly loses the oldest "
             'fixes and gets an event `dropped` with the data `{"dropped": 7}`. Comments keep it open.',
             "content": {
                 "text/event-stream": {

@@ -2,6 +2,14 @@
 import SwaggerUI from "swagger-ui-dist/swagger-ui-es-bundle.js";
 import licences from "swagger-ui-dist/swagger-ui-es-bundle.js.LICENSE.txt?url";
 import "swagger-ui-dist/swagger-ui.css";
+import "./style/interface.css";
+
+import { theme } from "./theme";
+
+// Dark or light as the viewer is; Swagger UI has the colours of both.
+const paint = (): void => void document.documentElement.classList.toggle("dark-mode", theme.name === "dark");
+theme.onChange(paint);
+paint();
 
 SwaggerUI({
   dom_id: "#interface",

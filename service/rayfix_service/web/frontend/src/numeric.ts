@@ -33,6 +33,8 @@ export function anglesOf(v: Vec3): { azimuth: number; zenith: number } {
 
 export const multiply = (m: Matrix3, v: Vec3): Vec3 => [dot(m[0]!, v), dot(m[1]!, v), dot(m[2]!, v)];
 
+export const transpose = (m: Matrix3): Matrix3 => [0, 1, 2].map((j) => m.map((row) => row[j as 0 | 1 | 2])) as unknown as Matrix3;
+
 /** Rotation from a station's local frame to the scene's: Rz(bearing) Ry(downtilt) Rx(slant), TR 38.901 (7.1-2). */
 export function localToScene(orientation: StationInfo["orientation"]): Matrix3 {
   const [ca, cb, cc] = [orientation.bearing_deg, orientation.downtilt_deg, orientation.slant_deg].map((a) =>

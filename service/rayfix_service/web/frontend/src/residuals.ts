@@ -1,6 +1,7 @@
 /** From a report and its fix: the paths that explain it, and what is left over of each measurement. */
 
-import { DEG, anglesOf, direction, localToScene, multiply, vec, wrap } from "./numeric";
+import { DEG, add, anglesOf, direction, localToScene, multiply, sub, transpose, vec, wrap } from "./numeric";
+import { signed, withDeviation } from "./rounding";
 import { explain, type Explanation, type Heard } from "./trace/explain";
 import type { Mirrors } from "./trace/mirrors";
 import type { Fix, Measurement, Report, Site, StationInfo, Vec3 } from "./types";
@@ -12,10 +13,10 @@ export interface Residual {
   outlierProbability: number | null;
   used: boolean;
   reason: string;
-  /** What was measured, in words. */
-  text: string;
-  /** Measured minus explained, in words; empty where nothing explains it. */
-  difference: string;
+  /** What was measured, a line for each number. */
+  text: readonly string[];
+  /** Measured minus explained, a line for each number, in the measurement's frame; empty where nothing explains it. */
+  difference: readonly string[];
   /** The largest of the differences in standard deviations; null where there is none. */
   sigmas: number | null;
 }
@@ -40,8 +41,10 @@ export function explainFix(mirrors: Mirrors, site: Site, report: Report, fix: Fi
       const mine = report.measurements.filter((m, n) => m.station_id === id && isGood(fix, n));
       const heard = heardBy(station, mine, site.table.site.north_deg * DEG);
       const most = site.table.site.max_path_length_m;
-      const path = explain(mirrors, vec(station.position), at, heard, site.settings.max_reflections, most);
-      if (path !== null) paths.set(id, path);
+      const { origin } = mirrors;
+      const [from, to] = [sub(vec(station.position), origin), sub(at, origin)];
+      const path = explain(mirrors, from, to, heard, site.settings.max_reflections, most);
+      if (path !== null) paths.set(id, { ...path, points: path.points.map((p) => add(p, origin)) });
     }
   }
   const offset = clockOffset(report, paths);
@@ -76,6 +79,18 @@ export function sceneAngles(
   if (m.frame !== "lcs") return { azimuth: wrap(azimuth), zenith };
   if (zenith === null) return { azimuth: wrap(azimuth + station.orientation.bearing_deg * DEG), zenith };
   return anglesOf(multiply(localToScene(station.orientation), direction(azimuth, zenith)));
+}
+
+/** Angles in the frame of a measurement, of a direction in the scene frame; rad. */
+export function measuredAngles(
+  m: Measurement,
+  station: StationInfo,
+  north: number,
+  scene: { azimuth: number; zenith: number },
+): { azimuth: number; zenith: number } {
+  if (m.frame === "north") return { azimuth: wrap(scene.azimuth - north), zenith: scene.zenith };
+  if (m.frame !== "lcs") return scene;
+  return anglesOf(multiply(transpose(localToScene(station.orientation)), direction(scene.azimuth, scene.zenith)));
 }
 
 function heardBy(station: StationInfo, measurements: Measurement[], north: number): Heard {
@@ -128,30 +143,33 @@ function difference(
   offset: number,
 ): Pick<Residual, "text" | "difference" | "sigmas"> {
   const path = paths.get(m.station_id);
-  if (m.type === "aoa") {
-    const whole = m.zenith_deg != null;
-    const text = whole
-      ? `${m.azimuth_deg!.toFixed(1)}°, ${m.zenith_deg!.toFixed(1)}° ± ${m.azimuth_stdev_deg}°`
-      : `${m.azimuth_deg!.toFixed(1)}° ± ${m.azimuth_stdev_deg}°`;
-    if (!path || !station) return { text, difference: "", sigmas: null };
-    const towards = sceneAngles(m, station, north);
-    const turn = wrap(towards.azimuth - path.azimuth) / DEG;
-    const tilt = towards.zenith === null ? null : (towards.zenith - path.zenith) / DEG;
-    const sigmas = Math.max(
-      Math.abs(turn) / (m.azimuth_stdev_deg ?? 1),
-      tilt === null ? 0 : Math.abs(tilt) / (m.zenith_stdev_deg ?? 1),
-    );
-    return { text, difference: signed(turn, "°") + (tilt === null ? "" : `, ${signed(tilt, "°")}`), sigmas };
-  }
+  if (m.type === "aoa") return angleDifference(m, station, north, path);
   const measured = lengthOf(m);
-  if (measured === null) return { text: m.type, difference: "", sigmas: null };
-  const text = `${measured.value.toFixed(2)} ± ${Number(measured.stdev.toPrecision(2))} m`;
+  if (measured === null) return { text: [m.type], difference: [], sigmas: null };
+  const { value, stdev } = measured;
+  const text = [withDeviation(value, stdev, " m")];
   const reference = m.reference_station_id === undefined ? undefined : paths.get(m.reference_station_id);
-  if (!path || (m.type === "tdoa" && !reference)) return { text, difference: "", sigmas: null };
+  if (!path || (m.type === "tdoa" && !reference)) return { text, difference: [], sigmas: null };
   const expected = m.type === "tdoa" ? path.length - reference!.length : path.length + (m.type === "toa" ? offset : 0);
-  const left = measured.value - expected;
-  return { text, difference: signed(left, " m"), sigmas: Math.abs(left) / measured.stdev };
+  const left = value - expected;
+  return { text, difference: [signed(left, stdev, " m")], sigmas: Math.abs(left) / stdev };
 }
 
-const signed = (value: number, unit: string): string =>
-  `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}${unit}`;
+function angleDifference(
+  m: Measurement,
+  station: StationInfo | undefined,
+  north: number,
+  path: Explanation | undefined,
+): Pick<Residual, "text" | "difference" | "sigmas"> {
+  const stdevs = { azimuth: m.azimuth_stdev_deg ?? 1, zenith: m.zenith_stdev_deg ?? 1 };
+  const text = [`azimuth ${withDeviation(m.azimuth_deg!, stdevs.azimuth, "°")}`];
+  if (m.zenith_deg != null) text.push(`zenith ${withDeviation(m.zenith_deg, stdevs.zenith, "°")}`);
+  if (!path || !station) return { text, difference: [], sigmas: null };
+  const expected = measuredAngles(m, station, north, path);
+  const turn = wrap(m.azimuth_deg! * DEG - expected.azimuth) / DEG;
+  const tilt = m.zenith_deg == null ? null : m.zenith_deg - expected.zenith / DEG;
+  const difference = [signed(turn, stdevs.azimuth, "°")];
+  if (tilt !== null) difference.push(signed(tilt, stdevs.zenith, "°"));
+  const sigmas = Math.max(Math.abs(turn) / stdevs.azimuth, Math.abs(tilt ?? 0) / stdevs.zenith);
+  return { text, difference, sigmas };
+}

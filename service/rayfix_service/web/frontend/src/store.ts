@@ -1,6 +1,7 @@
 /** The fixes that have come, by target, and which of them is looked at. */
 
 import { vec } from "./numeric";
+import { followTrack, type TrackHistory } from "./tracks";
 import type { FixEvent, Vec3 } from "./types";
 
 export interface Target {
@@ -8,13 +9,16 @@ export interface Target {
   latest: FixEvent;
   /** Positions, the latest last, m. */
   trail: Vec3[];
+  /** Where the service follows the target. */
+  track: TrackHistory | null;
   count: number;
   /** When the latest came, ms. */
   seen: number;
 }
 
 const UNNAMED = "(unnamed)";
-const TRAIL = 120;
+/** Positions of a trail. */
+export const TRAIL = 120;
 const MOST_TARGETS = 500;
 
 export class Store {
@@ -42,7 +46,7 @@ export class Store {
     let target = this.targets.get(id);
     if (target === undefined) {
       if (this.targets.size >= MOST_TARGETS) this.forgetOldest();
-      target = { id, latest: event, trail: [], count: 0, seen: 0 };
+      target = { id, latest: event, trail: [], track: null, count: 0, seen: 0 };
       this.targets.set(id, target);
     }
     // A posted report comes back over the stream, too; it is one fix.
@@ -53,6 +57,7 @@ export class Store {
     target.seen = performance.now();
     if (event.fix.position !== null) target.trail.push(vec(event.fix.position));
     if (target.trail.length > TRAIL) target.trail.shift();
+    if (event.fix.track) target.track = followTrack(target.track, event.fix.track, TRAIL);
     for (const listener of this.fixListeners) listener(target);
     if (!live || this.selected === null) this.select(id);
   }
@@ -68,6 +73,11 @@ export class Store {
     if (ids.length === 0) return;
     const at = this.selected === null ? -1 : ids.indexOf(this.selected.id);
     this.select(ids[(at + by + ids.length) % ids.length]!);
+  }
+
+  /** Whether the service follows any of them. */
+  get hasTracks(): boolean {
+    return [...this.targets.values()].some((target) => target.track !== null);
   }
 
   ordered(): Target[] {

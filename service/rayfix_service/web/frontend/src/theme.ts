@@ -15,6 +15,7 @@ export interface Palette {
   fix: number;
   rival: number;
   truth: number;
+  track: number;
   station: number;
   cloud: number;
   light: { sky: number; ground: number; ambient: number; sun: number };
@@ -31,6 +32,7 @@ const PALETTES: Record<Theme, Palette> = {
     fix: 0xff5c77,
     rival: 0xffa24d,
     truth: 0x3ddc97,
+    track: 0xf4f7fb,
     station: 0x7cc4ff,
     cloud: 0xff8fa3,
     light: { sky: 0xdfe9ff, ground: 0x39424f, ambient: 1.5, sun: 1.7 },
@@ -45,6 +47,7 @@ const PALETTES: Record<Theme, Palette> = {
     fix: 0xd81b4a,
     rival: 0xc96a00,
     truth: 0x0b8f5a,
+    track: 0x1b222c,
     station: 0x1463b8,
     cloud: 0xd81b4a,
     light: { sky: 0xffffff, ground: 0xb9c2ce, ambient: 2.0, sun: 1.6 },

@@ -65,6 +65,20 @@ export interface Outcome {
   reason?: string;
 }
 
+/** What is known of a target from all its reports, after one of them; docs/tracking.md. */
+export interface Track {
+  state: "started" | "updated" | "restarted" | "predicted" | "late";
+  timestamp: string;
+  num_reports: number;
+  probability: number;
+  position: Point;
+  covariance_m2: Matrix3;
+  velocity_m_s: Point;
+  velocity_covariance_m2_s2: Matrix3;
+  horizontal_accuracy_m: number;
+  vertical_accuracy_m: number;
+}
+
 export interface Fix {
   target_id: string | null;
   timestamp: string | null;
@@ -79,6 +93,8 @@ export interface Fix {
   measurements: Outcome[];
   /** Of an inconsistent fix; absent otherwise. */
   warnings?: string[];
+  /** Where the service follows the target. */
+  track?: Track | null;
   table_id: string;
   compute_ms: number;
 }

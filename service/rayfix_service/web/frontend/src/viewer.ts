@@ -23,6 +23,7 @@ import { Inspector } from "./ui/inspector";
 import { installKeys } from "./ui/keyboard";
 import type { Layout, Mode } from "./ui/layout";
 import { drawLegend } from "./ui/legend";
+import { Rulers } from "./ui/rulers";
 import { Simulator } from "./ui/simulator";
 import { Notices } from "./ui/status";
 import { TargetList } from "./ui/targetlist";
@@ -30,6 +31,7 @@ import { ViewPanel } from "./ui/viewpanel";
 
 const CLICK = 5; // px that a click may move
 const NEAR = 16; // px from a target that still mean it
+const LEAST_WIDTH = 240; // px of the drawing beside an open panel that legend and rulers need
 const LEAST_BETWEEN = 1000; // ms between posteriors of a stream
 
 const STREAM_TEXT: Record<StreamState, string> = {
@@ -93,8 +95,19 @@ export class Viewer {
     replace(layout.left, this.viewPanel.element, list.element);
     layout.site.textContent = site.table.site.name;
     document.title = `rayfix · ${site.table.site.name}`;
-    drawLegend(layout.legend, site.settings.max_reflections);
+    let hadTracks = false;
+    const legend = drawLegend(layout.legend, site.settings.max_reflections, () => this.store.hasTracks);
+    this.store.onFix(() => {
+      if (this.store.hasTracks === hadTracks) return;
+      hadTracks = this.store.hasTracks;
+      legend();
+      this.inset();
+    });
 
+    const rulers = new Rulers(stage, layout.canvas, () => layout.insets(), site.table.site.north_deg);
+    layout.labels.before(rulers.element);
+
+    layout.docs.hidden = api === null;
     layout.buttons.simulate.hidden = !site.settings.simulation;
     layout.buttons.paste.hidden = api === null;
     layout.tabs.table.hidden = api === null;
@@ -199,7 +212,8 @@ export class Viewer {
   }
 
   private describe(): void {
-    this.fixPanel.show(this.store.selected?.latest ?? null, this.explained);
+    const { selected } = this.store;
+    this.fixPanel.show(selected?.latest ?? null, this.explained, selected?.track ?? null);
   }
 
   private async loadPosterior(event: FixEvent): Promise<void> {
@@ -223,6 +237,8 @@ export class Viewer {
 
   /** Tell the drawing, and what lies over it, how much the panels cover. */
   private inset(): void {
+    const { left, right } = this.layout.insets();
+    this.layout.stage.classList.toggle("covered", this.layout.stage.clientWidth - left - right < LEAST_WIDTH);
     const insets = this.layout.insets();
     this.stage.setInsets(insets);
     this.layout.stage.style.setProperty("--left", `${insets.left}px`);
@@ -306,11 +322,11 @@ export class Viewer {
     const { clientWidth, clientHeight } = this.layout.canvas;
     let best: { id: string; apart: number } | null = null;
     for (const target of this.store.targets.values()) {
-      const at = target.trail[target.trail.length - 1];
-      if (at === undefined) continue;
-      const p = this.stage.local(at).project(this.stage.camera);
-      const apart = Math.hypot(((p.x + 1) / 2) * clientWidth - x, ((1 - p.y) / 2) * clientHeight - y);
-      if (apart < NEAR && (best === null || apart < best.apart)) best = { id: target.id, apart };
+      for (const at of this.targets.positionsOf(target)) {
+        const p = this.stage.local(at).project(this.stage.camera);
+        const apart = Math.hypot(((p.x + 1) / 2) * clientWidth - x, ((1 - p.y) / 2) * clientHeight - y);
+        if (apart < NEAR && (best === null || apart < best.apart)) best = { id: target.id, apart };
+      }
     }
     if (best !== null) this.store.select(best.id);
   }

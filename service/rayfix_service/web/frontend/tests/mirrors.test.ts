@@ -30,9 +30,11 @@ describe("the scene as mirrors", () => {
     });
   });
 
-  test("a mesh's origin moves the planes", () => {
-    const { planes } = new Mirrors({ ...ROOM, origin: [100, 200, 0] });
-    expect(planes.map((plane) => Math.round(1e6 * plane.offset) / 1e6).sort((a, b) => a - b)).toEqual([0, 3, 100, 105, 200, 204]);
+  test("a mesh's origin changes nothing: the frame is the mesh's", () => {
+    const moved = new Mirrors({ ...ROOM, origin: [2_600_000, 1_200_000, 400] });
+    expect(moved.planes).toEqual(new Mirrors(ROOM).planes);
+    expect(moved.step).toBe(new Mirrors(ROOM).step);
+    expect(moved.origin).toEqual([2_600_000, 1_200_000, 400]);
   });
 
   test("nothing is between points of an empty room; a cupboard is between those on both sides of it", () => {

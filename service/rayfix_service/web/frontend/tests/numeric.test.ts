@@ -1,6 +1,6 @@
 import { describe, expect, test } from "vitest";
 
-import { DEG, add, anglesOf, cross, direction, dot, eigen, length, localToScene, multiply, scale, sub, unit, wrap } from "../src/numeric";
+import { DEG, add, anglesOf, cross, direction, dot, eigen, length, localToScene, multiply, scale, sub, transpose, unit, wrap } from "../src/numeric";
 import type { Matrix3, Vec3 } from "../src/types";
 import { between, random, randomVector } from "./rooms";
 
@@ -73,6 +73,12 @@ describe("a station's frame", () => {
 
   test("a station with a bearing of 45 and a downtilt of 30 deg looks down into that corner", () => {
     near(multiply(turned(45, 30, 0), [1, 0, 0]), direction(45 * DEG, 120 * DEG));
+  });
+
+  test("the transposed one turns back", () => {
+    const rotation = turned(30, -20, 50);
+    near(multiply(transpose(rotation), multiply(rotation, [1, 2, 3])), [1, 2, 3]);
+    expect(transpose([[1, 2, 3], [4, 5, 6], [7, 8, 9]])).toEqual([[1, 4, 7], [2, 5, 8], [3, 6, 9]]);
   });
 
   test("all are rotations", () => {

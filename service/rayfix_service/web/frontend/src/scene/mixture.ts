@@ -1,8 +1,8 @@
 /** What the table inspector draws: the mixture of a direction, and the ray that it is of. */
 
-import { Group } from "three";
+import { Group, Vector3 } from "three";
 
-import { DEG, direction, vec } from "../numeric";
+import { DEG, direction, sub, vec } from "../numeric";
 import { theme } from "../theme";
 import type { Mirrors } from "../trace/mirrors";
 import type { MixtureView, Site } from "../types";
@@ -64,10 +64,11 @@ export class Mixture {
     const { max_reflections } = this.site.settings;
     const towards = direction(aim.azimuthDeg * DEG, aim.zenithDeg * DEG);
     const most = this.site.table.site.max_path_length_m;
-    const { points } = this.mirrors.follow(vec(station.position), towards, max_reflections, most);
+    const from = sub(vec(station.position), this.mirrors.origin);
+    const { points } = this.mirrors.follow(from, towards, max_reflections, most);
     const lines: FatLine[] = [];
     for (let n = 0; n + 1 < points.length; n++) {
-      const piece = [this.stage.local(points[n]!), this.stage.local(points[n + 1]!)];
+      const piece = [new Vector3(...points[n]!), new Vector3(...points[n + 1]!)];
       lines.push({ points: piece, colour: theme.reflections(n), width: 2, opacity: 0.8, throughWalls: true });
     }
     this.lines.set(lines);

@@ -13,6 +13,8 @@ import type { Stage } from "./stage";
 export const SIGMAS = 2;
 
 export interface Shown {
+  /** The fix itself, and with it all that is drawn of it. */
+  fix: boolean;
   paths: boolean;
   rivals: boolean;
   cloud: boolean;
@@ -20,7 +22,7 @@ export interface Shown {
 
 export class Selection {
   readonly group = new Group();
-  readonly shown: Shown = { paths: true, rivals: true, cloud: true };
+  readonly shown: Shown = { fix: true, paths: true, rivals: true, cloud: true };
   private readonly cloud = new Dots({ opacity: 0.45, throughWalls: true });
   private readonly dots = new Dots({ rim: 0.25, throughWalls: true });
   private readonly ellipsoids = new Ellipsoids();
@@ -56,6 +58,7 @@ export class Selection {
     const dots: Dot[] = [];
     if (event !== null) {
       event.fix.candidates.forEach((candidate, n) => {
+        if (!this.shown.fix) return;
         if (n > 0 && !this.shown.rivals) return;
         const at = stage.local(vec(candidate.position));
         const colour = n === 0 ? palette.fix : palette.rival;
@@ -81,10 +84,10 @@ export class Selection {
       }
     }
     this.ellipsoids.set(shells);
-    this.lines.set(this.shown.paths && this.explained !== null ? this.paths(this.explained, dots) : []);
+    this.lines.set(this.shown.fix && this.shown.paths && this.explained !== null ? this.paths(this.explained, dots) : []);
     this.dots.setRim(palette.background);
     this.dots.set(dots);
-    this.cloud.set(this.shown.cloud ? this.cloudDots() : []);
+    this.cloud.set(this.shown.fix && this.shown.cloud ? this.cloudDots() : []);
     stage.invalidate();
   }
 

@@ -91,6 +91,11 @@ export class Stage {
     this.resize();
   }
 
+  /** Of the canvas, px. */
+  get extent(): { width: number; height: number } {
+    return this.size;
+  }
+
   /** A place of the scene frame in the world's. */
   local(p: Vec3): Vector3 {
     return new Vector3(p[0] - this.origin[0], p[1] - this.origin[1], p[2] - this.origin[2]);

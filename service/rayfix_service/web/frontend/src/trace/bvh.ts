@@ -10,7 +10,7 @@ export interface Hit {
 }
 
 export class Bvh {
-  /** Corners of each triangle, nine numbers, in the scene frame. */
+  /** Corners of each triangle, nine numbers, in the frame of the rays. */
   readonly corners: Float64Array;
   readonly count: number;
   private readonly order: Uint32Array;

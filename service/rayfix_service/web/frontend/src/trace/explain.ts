@@ -37,6 +37,7 @@ const WORST = 60; // squared misfit of what still explains anything
 const SHORTER = 1e-6; // of misfit for each metre: of paths that fit alike the shorter one, which is the stronger, is told
 const GOLDEN = Math.PI * (3 - Math.sqrt(5));
 
+/** Find the path; all positions are in the frame of the mirrors. */
 export function explain(
   mirrors: Mirrors,
   station: Vec3,

@@ -1,4 +1,9 @@
-/** The scene as mirrors: its triangles with the planes they lie on, and rays among them. */
+/**
+ * The scene as mirrors: its triangles with the planes they lie on, and rays among them.
+ *
+ * All positions are in the frame of the mesh, the scene's less `origin`: on map coordinates, which may be millions of
+ * metres, an error of a normal's direction would move its plane by metres.
+ */
 
 import { add, cross, dot, length, scale, sub, unit } from "../numeric";
 import type { Mesh, Vec3 } from "../types";
@@ -20,6 +25,8 @@ export interface Polyline {
 
 export class Mirrors {
   readonly bvh: Bvh;
+  /** Of the mesh's frame in the scene frame, m. */
+  readonly origin: Vec3;
   readonly planes: Plane[] = [];
   /** Plane of each triangle. */
   private readonly planeOf: Int32Array;
@@ -27,6 +34,7 @@ export class Mirrors {
   readonly step: number;
 
   constructor(mesh: Mesh) {
+    this.origin = mesh.origin;
     const total = mesh.groups.reduce((sum, group) => sum + group.indices.length / 3, 0);
     const corners = new Float64Array(9 * total);
     let place = 0;
@@ -34,7 +42,7 @@ export class Mirrors {
     for (const group of mesh.groups) {
       for (const index of group.indices) {
         for (let k = 0; k < 3; k++) {
-          const value = mesh.positions[3 * index + k]! + mesh.origin[k]!;
+          const value = mesh.positions[3 * index + k]!;
           corners[place++] = value;
           largest = Math.max(largest, Math.abs(value));
         }

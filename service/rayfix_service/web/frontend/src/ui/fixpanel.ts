@@ -2,9 +2,12 @@
 
 import { bar, h, replace, swatch } from "../dom";
 import type { ExplainedFix, Residual } from "../residuals";
+import { deviation } from "../rounding";
 import { percent } from "../scene/selection";
 import { hex, theme } from "../theme";
+import type { TrackHistory } from "../tracks";
 import type { Fix, FixEvent, Point } from "../types";
+import { coordinates, fact, pointText, trackBlock } from "./trackblock";
 
 const MEANING = {
   ok: "one place is likely",
@@ -17,6 +20,14 @@ const SOURCES = { stream: "live", posted: "posted here", simulated: "simulated",
 
 const KINDS: Record<string, string> = { aoa: "angle", pt: "range", toa: "arrival", tdoa: "difference", rssi: "strength" };
 
+/** Frames of angles, as docs/conventions.md names them. */
+const FRAMES = {
+  scene: "scene frame: azimuth counter-clockwise from +x, zenith from +z",
+  lcs: "the station's own frame (LCS)",
+  north: "azimuth counter-clockwise from north, zenith from +z",
+} as const;
+const FRAME_NAMES = { scene: "scene frame", lcs: "LCS", north: "from north" } as const;
+
 const isTrusted = (fix: Fix): boolean => fix.status !== "inconsistent";
 
 export class FixPanel {
@@ -24,7 +35,7 @@ export class FixPanel {
 
   constructor(private readonly onFocus: (place: Point) => void) {}
 
-  show(event: FixEvent | null, explained: ExplainedFix | null): void {
+  show(event: FixEvent | null, explained: ExplainedFix | null, track: TrackHistory | null): void {
     if (event === null) {
       replace(
         this.element,
@@ -46,6 +57,7 @@ export class FixPanel {
       fix.timestamp !== null && h("p", { className: "muted number stamp" }, fix.timestamp),
       fix.position === null ? h("p", {}, "No position.") : this.position(event),
       fix.warnings?.length ? h("ul", { className: "warnings" }, ...fix.warnings.map((text) => h("li", {}, text))) : null,
+      track !== null && trackBlock(track.latest, fix.confidence, this.onFocus),
       isTrusted(fix) && fix.candidates.length > 1 && this.rivals(event),
       this.measurements(explained),
     );
@@ -55,27 +67,20 @@ export class FixPanel {
     const { fix, truth } = event;
     const p = fix.position!;
     const error = truth && Math.hypot(p.x - truth[0], p.y - truth[1], p.z - truth[2]);
-    const row = (name: string, value: string, title = ""): HTMLElement =>
-      h("div", { title }, h("dt", {}, name), h("dd", {}, value));
     return h(
       "div",
       {},
-      h(
-        "button",
-        { type: "button", className: "coordinates", title: "Look there (Enter)", onclick: () => this.onFocus(p) },
-        ...(["x", "y", "z"] as const).map((axis) => h("span", {}, h("small", {}, axis), p[axis].toFixed(2))),
-        h("span", { className: "unit" }, "m"),
-      ),
+      coordinates(p, fix.covariance_m2, this.onFocus, "Look there (Enter)"),
       h(
         "dl",
         { className: "facts" },
         // Probabilities hold for measurements that the model is of, which those of an inconsistent fix are not.
         isTrusted(fix) &&
-          row("horizontal", `± ${fix.horizontal_accuracy_m!.toFixed(2)} m`, `with a probability of ${percent(fix.confidence)}`),
+          fact("horizontal", `± ${deviation(fix.horizontal_accuracy_m!)} m`, `with a probability of ${percent(fix.confidence)}`),
         isTrusted(fix) &&
-          row("vertical", `± ${fix.vertical_accuracy_m!.toFixed(2)} m`, `with a probability of ${percent(fix.confidence)}`),
-        isTrusted(fix) && row("held with", percent(fix.confidence), "probability that the target is within the accuracies"),
-        error === undefined ? row("computed in", `${fix.compute_ms.toFixed(1)} ms`) : row("true error", `${error.toFixed(2)} m`),
+          fact("vertical", `± ${deviation(fix.vertical_accuracy_m!)} m`, `with a probability of ${percent(fix.confidence)}`),
+        isTrusted(fix) && fact("held with", percent(fix.confidence), "probability that the target is within the accuracies"),
+        error === undefined ? fact("computed in", `${fix.compute_ms.toFixed(1)} ms`) : fact("true error", `${error.toFixed(2)} m`),
       ),
     );
   }
@@ -89,7 +94,7 @@ export class FixPanel {
       list.append(
         h(
           "li",
-          { onclick: () => this.onFocus(p), title: `(${p.x.toFixed(2)}, ${p.y.toFixed(2)}, ${p.z.toFixed(2)}) m` },
+          { onclick: () => this.onFocus(p), title: `${pointText(p, candidate.covariance_m2)} m` },
           h("span", {}, n === 0 ? "this fix" : `rival ${n}`),
           bar(candidate.probability, n === 0 ? "best" : "rival"),
           h("span", { className: "number" }, percent(candidate.probability)),
@@ -114,6 +119,7 @@ export class FixPanel {
   private row(residual: Residual, explained: ExplainedFix): HTMLElement[] {
     const { measurement: m, sigmas } = residual;
     const path = explained.paths.get(m.station_id);
+    const frame = m.type === "aoa" ? (m.frame ?? "scene") : undefined;
     const outlier = residual.outlierProbability ?? 0;
     const className = !residual.used ? "unused" : outlier > 0.5 ? "outlier" : "";
     const how = path ? (path.numReflections === 0 ? "direct" : `${path.numReflections} refl.`) : "no path found";
@@ -129,8 +135,8 @@ export class FixPanel {
         "tr",
         { className },
         h("th", { scope: "row" }, station, h("small", {}, KINDS[m.type] ?? m.type)),
-        h("td", {}, residual.text, h("small", {}, swatchOf(path?.numReflections), how)),
-        h("td", { className: "left" }, residual.difference || "–", meter),
+        h("td", {}, ...lines(residual.text), h("small", { title: frame && FRAMES[frame] }, swatchOf(path?.numReflections), how, frame && ` · ${FRAME_NAMES[frame]}`)),
+        h("td", { className: "left" }, ...(residual.difference.length ? lines(residual.difference) : ["–"]), meter),
       ),
       ...(!residual.used || outlier > 0.05
         ? [
@@ -144,6 +150,8 @@ export class FixPanel {
     ];
   }
 }
+
+const lines = (texts: readonly string[]): HTMLElement[] => texts.map((text) => h("div", {}, text));
 
 const swatchOf = (reflections: number | undefined): HTMLElement | null =>
   reflections === undefined ? null : swatch(hex(theme.reflections(reflections)));

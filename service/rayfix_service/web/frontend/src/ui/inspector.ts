@@ -3,11 +3,14 @@
 import { ServiceError, type Api } from "../api";
 import { bar, h, replace, swatch } from "../dom";
 import type { Aim, Mixture } from "../scene/mixture";
+import { withDeviation } from "../rounding";
 import { percent } from "../scene/selection";
 import { hex, theme } from "../theme";
 import type { Coverage, MixtureView, Site } from "../types";
+import { pointText } from "./trackblock";
 
 const SHOWN_COMPONENTS = 12;
+const FRAME = "Angles are in the scene frame: azimuth counter-clockwise from +x, zenith from +z.";
 
 export class Inspector {
   readonly element = h("section", { className: "block inspector" });
@@ -58,7 +61,7 @@ export class Inspector {
     ];
     this.element.append(
       h("h2", {}, "Table inspector"),
-      h("p", { className: "muted" }, "Where can a signal come from that this station measures at this angle?"),
+      h("p", { className: "muted" }, "Where can a signal come from that this station measures at this angle? ", FRAME),
       h(
         "div",
         { className: "rows three" },
@@ -143,14 +146,14 @@ export class Inspector {
     const row = (name: string, value: string): HTMLElement => h("div", {}, h("dt", {}, name), h("dd", {}, value));
     const place =
       view.num_cells === 1 && cell
-        ? `${cell.index} at ${cell.azimuth_deg.toFixed(1)}°, ${cell.zenith_deg.toFixed(1)}°`
+        ? `${cell.index} at azimuth ${cell.azimuth_deg.toFixed(1)}°, zenith ${cell.zenith_deg.toFixed(1)}°`
         : `${view.num_cells} cells summed`;
     replace(
       this.facts,
       h(
         "dl",
         { className: "facts" },
-        row("level", `${view.level} of 0–${station.levels.length - 1}, window ${view.window_deg}°`),
+        row("level", `${view.level} of 0–${station.levels.length - 1}, window ${Number(view.window_deg.toPrecision(3))}°`),
         row("cell", place),
         row("components", String(view.num_components)),
       ),
@@ -170,8 +173,8 @@ export class Inspector {
           "tr",
           {},
           h("td", {}, swatch(hex(theme.reflections(component.num_reflections))), percent(component.probability)),
-          h("td", {}, `${p.x.toFixed(1)}, ${p.y.toFixed(1)}, ${p.z.toFixed(1)}`),
-          h("td", {}, `${component.path_length_m.toFixed(1)} ± ${component.path_length_stdev_m.toFixed(1)}`),
+          h("td", {}, pointText(p, component.covariance_m2)),
+          h("td", {}, withDeviation(component.path_length_m, component.path_length_stdev_m, "")),
         ),
       );
     }

@@ -15,6 +15,7 @@ export interface Layout {
   hint: HTMLElement;
   site: HTMLElement;
   connection: HTMLElement;
+  docs: HTMLElement;
   tabs: Record<Mode, HTMLButtonElement>;
   buttons: Record<"simulate" | "paste" | "theme" | "help", HTMLButtonElement>;
   /** Space that the panels take from the drawing, px. */
@@ -38,6 +39,7 @@ export function buildLayout(root: HTMLElement): Layout {
   const right = h("aside", { id: "right", className: "panel", "aria-label": "Details" });
   const site = h("span", { id: "site" });
   const connection = h("span", { id: "connection", role: "status" });
+  const docs = h("a", { id: "docs", className: "button", href: "docs", title: "The HTTP interface" }, "API");
   const tab = (name: string, title: string): HTMLButtonElement =>
     h("button", { className: "tab", role: "tab", type: "button", title }, name);
   const tabs = { fixes: tab("Fixes", "Reports and their fixes (F)"), table: tab("Table", "Table inspector (I)") };
@@ -78,6 +80,7 @@ export function buildLayout(root: HTMLElement): Layout {
     h("span", { className: "gap" }),
     buttons.simulate,
     buttons.paste,
+    docs,
     buttons.theme,
     buttons.help,
     toggle(right, "Details", "open-right"),
@@ -105,6 +108,7 @@ export function buildLayout(root: HTMLElement): Layout {
     hint,
     site,
     connection,
+    docs,
     tabs,
     buttons,
     insets: () => ({

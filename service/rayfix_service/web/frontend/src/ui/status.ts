@@ -29,7 +29,7 @@ export class StatusScreen {
   /** Ask for the key that the service wants. */
   askKey(wrong: boolean): Promise<string> {
     return new Promise((resolve) => {
-      const input = h("input", { type: "password", autocomplete: "off", required: true, "aria-label": "API key" });
+      const input = h("input", { id: "key", type: "password", autocomplete: "off", required: true });
       const form = h(
         "form",
         {
@@ -39,10 +39,12 @@ export class StatusScreen {
             resolve(input.value.trim());
           },
         },
-        h("h2", {}, "API key"),
-        h("p", {}, wrong ? "The service does not know this key." : "The service asks for a key. It is kept until this tab is closed."),
+        h("span", { className: "brand" }, "rayfix"),
+        h("h2", {}, h("label", { htmlFor: "key" }, "API key")),
+        h("p", { className: wrong ? "warning" : "muted" }, wrong ? "The service does not know this key." : "The service asks for a key. It is kept until this tab is closed."),
         input,
         h("button", { type: "submit", className: "primary" }, "Open"),
+        h("a", { href: "docs" }, "The HTTP interface"),
       );
       this.element.className = "key";
       replace(this.element, form);

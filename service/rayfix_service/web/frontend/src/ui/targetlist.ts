@@ -1,6 +1,7 @@
 /** The targets that were heard of, in a list. */
 
 import { h, replace } from "../dom";
+import { deviation } from "../rounding";
 import type { Store, Target } from "../store";
 
 const REFRESH = 250; // ms; more often would be for nobody's eyes
@@ -54,16 +55,21 @@ export class TargetList {
       this.rows.set(target.id, row);
     }
     const { fix } = target.latest;
-    const accuracy = fix.horizontal_accuracy_m === null ? "no position" : `± ${fix.horizontal_accuracy_m.toFixed(2)} m`;
+    const accuracy = fix.horizontal_accuracy_m === null ? "no position" : `± ${deviation(fix.horizontal_accuracy_m)} m`;
+    const track = target.track?.latest;
     row.setAttribute("aria-selected", String(this.store.selected === target));
-    const key = `${fix.status} ${accuracy}`;
+    const tracked = track && `± ${deviation(track.horizontal_accuracy_m)} m`;
+    const key = [fix.status, accuracy, track?.state, tracked].join(" ");
     if (row.dataset["key"] !== key) {
       row.dataset["key"] = key;
       replace(
         row,
         h("span", { className: `led ${fix.status}`, title: fix.status }),
         h("span", { className: "name" }, target.id),
-        h("span", { className: "number" }, accuracy),
+        // A track knows more than the fix.
+        track
+          ? h("span", { className: "number", title: `track ${track.state}; fix ${accuracy}` }, h("small", {}, track.state), ` ${tracked}`)
+          : h("span", { className: "number" }, accuracy),
       );
     }
     return row;

@@ -40,11 +40,17 @@ export class ViewPanel {
       const box = h("input", { type: "checkbox", checked: initial, onchange: () => change(box.checked) });
       toggles.append(h("label", {}, box, name));
     };
+    check("Fixes", true, (v) => {
+      selection.shown.fix = targets.shown.fixes = v;
+      selection.draw();
+      targets.refresh();
+    });
+    check("Tracks", true, (v) => ((targets.shown.tracks = v), targets.refresh()));
     check("Paths", true, (v) => ((selection.shown.paths = v), selection.draw()));
     check("Rivals", true, (v) => ((selection.shown.rivals = v), selection.draw()));
     check("Posterior", true, (v) => ((selection.shown.cloud = v), selection.draw()));
-    check("Trails", true, (v) => ((targets.showTrails = v), targets.refresh()));
-    check("Names", true, (v) => ((targets.showLabels = v), targets.refresh()));
+    check("Trails", true, (v) => ((targets.shown.trails = v), targets.refresh()));
+    check("Names", true, (v) => ((targets.shown.names = v), targets.refresh()));
     this.element.append(toggles);
     this.mark();
   }

@@ -1,0 +1,90 @@
+import { describe, expect, test } from "vitest";
+
+import { DEG, add, wrap } from "../src/numeric";
+import { explainFix, measuredAngles, sceneAngles } from "../src/residuals";
+import { Mirrors } from "../src/trace/mirrors";
+import type { Fix, Measurement, Report, Site, StationInfo, Vec3 } from "../src/types";
+import { between, boxes, random } from "./rooms";
+
+const STATION: Vec3 = [1, 1.5, 2];
+const POSITION: Vec3 = [4, 1.5, 1];
+
+function station(at: Vec3): StationInfo {
+  return {
+    id: "bs1",
+    position: { x: at[0], y: at[1], z: at[2] },
+    orientation: { bearing_deg: 40, downtilt_deg: 20, slant_deg: -15 },
+    boresight: { azimuth_deg: 40, downtilt_deg: 20 },
+    field_of_view_deg: 360,
+    levels: [],
+  };
+}
+
+describe("angles in the frame of a measurement", () => {
+  test("are those that the scene's were made of, in every frame", () => {
+    const draw = random(7);
+    for (const frame of ["scene", "north", "lcs"] as const) {
+      for (let n = 0; n < 30; n++) {
+        const m: Measurement = {
+          type: "aoa",
+          station_id: "bs1",
+          frame,
+          azimuth_deg: between(draw, -179, 179),
+          zenith_deg: between(draw, 5, 175),
+        };
+        const scene = sceneAngles(m, station(STATION), 0.7);
+        const back = measuredAngles(m, station(STATION), 0.7, { azimuth: scene.azimuth, zenith: scene.zenith! });
+        expect(wrap(back.azimuth - m.azimuth_deg! * DEG)).toBeCloseTo(0, 9);
+        expect(back.zenith).toBeCloseTo(m.zenith_deg! * DEG, 9);
+      }
+    }
+  });
+
+  test("of a tilted station are those of its own frame, also where only the azimuth was measured", () => {
+    const whole: Measurement = { type: "aoa", station_id: "bs1", frame: "lcs", azimuth_deg: 60, zenith_deg: 120 };
+    const scene = sceneAngles(whole, station(STATION), 0);
+    const alone: Measurement = { type: "aoa", station_id: "bs1", frame: "lcs", azimuth_deg: 60 };
+    const found = measuredAngles(alone, station(STATION), 0, { azimuth: scene.azimuth, zenith: scene.zenith! });
+    expect(found.azimuth).toBeCloseTo(60 * DEG, 9);
+  });
+});
+
+describe("a fix explained", () => {
+  /** A room whose mesh and positions are all moved by `origin`; the report tells of the reflection at the wall y = 4. */
+  function explained(origin: Vec3): ReturnType<typeof explainFix> {
+    const mesh = { ...boxes([[0, 0, 0], [5, 4, 3]]), origin };
+    const straight = [3, 5, -1] as const;
+    const measurements: Measurement[] = [
+      {
+        type: "aoa",
+        station_id: "bs1",
+        azimuth_deg: Math.atan2(straight[1], straight[0]) / DEG + 0.5,
+        azimuth_stdev_deg: 1.000416579897,
+        zenith_deg: Math.acos(-1 / Math.hypot(...straight)) / DEG,
+        zenith_stdev_deg: 2,
+      },
+      { type: "pt", station_id: "bs1", range_m: Math.hypot(...straight) - 0.25, stdev_m: 0.5 },
+    ];
+    const report: Report = { measurements };
+    const fix = { measurements: measurements.map((_, index) => ({ index, used: true, outlier_probability: 0 })) } as unknown as Fix;
+    const site: Site = {
+      table: { name: "", table_id: "", software_version: "", num_components: 0, site: { name: "", north_deg: 0, max_path_length_m: 30 } },
+      stations: [station(add(STATION, origin))],
+      settings: { simulation: false, max_reflections: 2 },
+    };
+    return explainFix(new Mirrors(mesh), site, report, fix, add(POSITION, origin));
+  }
+
+  test.each([[[0, 0, 0]], [[2_600_000, 1_200_000, 400]]] as const)("has its path and differences, with its origin at %j", (origin) => {
+    const { paths, residuals } = explained(origin);
+    const path = paths.get("bs1")!;
+    expect(path.numReflections).toBe(1);
+    const middle = path.points[1]!.map((v, k) => v - origin[k]!);
+    [2.5, 4, 1.5].forEach((value, k) => expect(middle[k]).toBeCloseTo(value, 5));
+    expect(residuals.map((r) => [r.text, r.difference])).toEqual([
+      [["azimuth 59.5 ± 1.0°", "zenith 99.7 ± 2.0°"], ["+0.5°", "0.0°"]],
+      [["5.67 ± 0.50 m"], ["−0.25 m"]],
+    ]);
+    expect(residuals[0]!.sigmas).toBeCloseTo(0.5, 2);
+  });
+});
