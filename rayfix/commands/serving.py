@@ -60,7 +60,6 @@ def add_commands(add: AddCommand) -> None:
     serve.add_argument(
         "--root-path",
         type=web_prefix,
-        default="",
         metavar="PATH",
         help="path below which a proxy offers the service, e.g. /rayfix; the proxy may take it off or not",
     )
@@ -132,7 +131,7 @@ def _serve(options: argparse.Namespace) -> int:
             reports_per_second=options.rate_limit,
             cors_origins=tuple(options.cors_origin),
             hosts=tuple(options.allowed_host),
-            root_path=options.root_path,
+            root_path=options.root_path or "",
             trust_forwarded_prefix=options.trust_forwarded_prefix,
             connection_limits=ConnectionLimits(
                 connections=options.connections,

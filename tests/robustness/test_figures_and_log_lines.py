@@ -75,6 +75,13 @@ def test_any_message_is_one_line_of_text():
     assert log_config("text", access_log=False)["formatters"]["default"]["()"].endswith("TextFormatter")
 
 
+def test_a_line_of_text_has_its_time():
+    form = log_config("text", access_log=False)["formatters"]["default"]["fmt"]
+    record = logging.LogRecord("x", logging.WARNING, "", 1, "text", (), None)
+    record.created = 1769853600.25
+    assert TextFormatter(form, use_colors=False).format(record) == "2026-01-31T10:00:00.250Z WARNING:  text"
+
+
 @pytest.mark.parametrize(
     "accept",
     [

@@ -62,7 +62,7 @@ async def post_nrppa(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    return await answer_one(lambda text: foreign(parse_nrppa(text)), body, answerer, table, options)
+    return await answer_one(lambda text: foreign(parse_nrppa(text)), body, answerer, table, options, "nrppa")
 
 
 @router.post(
@@ -76,7 +76,7 @@ async def post_silabs(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    return await answer_one(lambda text: foreign(parse_silabs(text)), body, answerer, table, options)
+    return await answer_one(lambda text: foreign(parse_silabs(text)), body, answerer, table, options, "silabs")
 
 
 @router.post(
@@ -90,7 +90,8 @@ async def post_nrppa_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Locate each message on its own; one that cannot be used gets a problem and leaves the others alone."""
-    return JsonAnswer({"results": await answer_batch(request, answerer, table, body, options, _read_nrppa)})
+    results = await answer_batch(request, answerer, table, body, options, _read_nrppa, "nrppa_batch")
+    return JsonAnswer({"results": results})
 
 
 @router.post(
@@ -104,7 +105,8 @@ async def post_silabs_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Locate each packet on its own; one that cannot be used gets a problem and leaves the others alone."""
-    return JsonAnswer({"results": await answer_batch(request, answerer, table, body, options, _read_silabs)})
+    results = await answer_batch(request, answerer, table, body, options, _read_silabs, "silabs_batch")
+    return JsonAnswer({"results": results})
 
 
 def _read_nrppa(text: bytes, most_problems: int) -> Incoming:
@@ -149,5 +151,5 @@ async def post_ublox(
     cooperation = Cooperation(request)
     for adapted in messages:
         await cooperation.let_others_run()
-        results.append(await answerer.answer_or_problem(table, partial(foreign, adapted), options))
+        results.append(await answerer.answer_or_problem(table, partial(foreign, adapted), options, "ublox"))
     return JsonAnswer({"results": results})

@@ -52,7 +52,7 @@ async def post_position(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
-    return await answer_one(native, body, answerer, table, options)
+    return await answer_one(native, body, answerer, table, options, "positions")
 
 
 async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple[bytes, str]:
@@ -66,11 +66,12 @@ async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple
     table = services.tables.named(None)
     body = await read_body(scope, receive, services.settings.body_limits.report)
     options = response_options_of(scope, services.settings)
-    incoming = await answerer.read(native, body)
-    await asyncio.sleep(0)
-    located = await answerer.locate(table, incoming, options)
-    await asyncio.sleep(0)
-    return write_json(answerer.write(table, incoming, options, located)), options.media_type
+    with answerer.metrics.reports.timed("positions"):
+        incoming = await answerer.read(native, body)
+        await asyncio.sleep(0)
+        located = await answerer.locate(table, incoming, options)
+        await asyncio.sleep(0)
+        return write_json(answerer.write(table, incoming, options, located)), options.media_type
 
 
 @router.post(
@@ -84,7 +85,7 @@ async def post_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
-    return JsonAnswer({"results": await answer_batch(request, answerer, table, body, options, _read_native)})
+    return JsonAnswer({"results": await answer_batch(request, answerer, table, body, options, _read_native, "batch")})
 
 
 def _read_native(text: bytes, most_problems: int) -> Incoming:
