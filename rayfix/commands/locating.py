@@ -12,10 +12,10 @@ from rayfix.commands.arguments import (
     add_output_arguments,
     hub_settings,
 )
+from rayfix.commands.broker import PASSWORD_VARIABLE
 from rayfix.extras import needs_extra
 
 _INPUTS = ("native", "nrppa", "silabs", "ublox")
-_PASSWORD_VARIABLE = "RAYFIX_MQTT_PASSWORD"  # not an argument, which other users of the machine could read
 
 
 def add_commands(add: AddCommand) -> None:
@@ -51,7 +51,7 @@ def add_commands(add: AddCommand) -> None:
     mqtt.add_argument("--track", action="store_true", help="follow tags from packet to packet")
     add_hub_argument(mqtt)
     mqtt.add_argument("--tls", action="store_true", help="encrypt; the port is then 8883 unless given")
-    mqtt.add_argument("--username", help=f"the password is taken from the environment variable {_PASSWORD_VARIABLE}")
+    mqtt.add_argument("--username", help=f"the password is taken from the environment variable {PASSWORD_VARIABLE}")
 
 
 def _locate(options: argparse.Namespace) -> int:
@@ -83,12 +83,12 @@ def _mqtt(options: argparse.Namespace) -> int:
     with needs_extra("mqtt"):
         from rayfix.mqtt import serve_mqtt
         from rayfix_service.adapters.adapted import known_height, station_map
-        from rayfix_service.adapters.mqtt import MqttSettings, parse_broker
+        from rayfix_service.adapters.mqtt.settings import MqttSettings, parse_broker
     broker = parse_broker(
         options.broker,
         tls=options.tls,
         username=options.username,
-        password=os.environ.get(_PASSWORD_VARIABLE),
+        password=os.environ.get(PASSWORD_VARIABLE),
     )
     settings = MqttSettings(
         topic=options.topic,

@@ -117,6 +117,7 @@ def figures() -> dict[str, set[str]]:
     station = Station(id="a", position=(0.0, 0.0, 0.0))
     site = SiteInfo(name="site", north=0.0, max_path_length=100.0, stations=(station,))
     metrics.fix_done(fix, 0.01, table="site", site=site, report=Report(measurements=measured))
+    metrics.broker_connected("broker:1883", True)
     text, _ = metrics.exposition("text/plain")
     found: dict[str, set[str]] = {"up": {"job", "instance"}}
     for family in text_string_to_metric_families(text.decode()):

@@ -83,6 +83,20 @@ class Metrics:
             registry=self._registry,
         )
         self._told = {outcome: told.labels(outcome) for outcome in get_args(HubOutcome)}
+        messages = Counter(
+            "rayfix_mqtt_messages",
+            "Messages of the MQTT broker by what became of them: taken, repeated (delivered twice) or passed over",
+            ("outcome",),
+            registry=self._registry,
+        )
+        self._messages = {outcome: messages.labels(outcome) for outcome in ("taken", "repeated", "passed_over")}
+        self._broker = Gauge(
+            "rayfix_mqtt_connected",
+            "1 while the MQTT broker is connected; absent where none is read",
+            ("broker",),
+            registry=self._registry,
+            multiprocess_mode="livemax",
+        )
         closed = Counter(
             "rayfix_connections_closed",
             "Connections that the service closed by itself, by the reason",
@@ -156,6 +170,14 @@ class Metrics:
     def hub_told(self, outcome: HubOutcome) -> None:
         """Count a position for the omlox hub."""
         self._told[outcome].inc()
+
+    def broker_message(self, outcome: str) -> None:
+        """Count a message of the MQTT broker."""
+        self._messages[outcome].inc()
+
+    def broker_connected(self, address: str, connected: bool) -> None:
+        """Tell whether the MQTT broker is connected."""
+        self._broker.labels(address).set(connected)
 
     def connection_closed(self, reason: Closed) -> None:
         """Count a connection that the service closed by itself."""
