@@ -166,6 +166,8 @@ class MqttSession:
         Locates each packet.
     on_message : callable
         Called with what became of each message.
+    site : callable, optional
+        Returns the site whose stations are read now; without it, they stay those of the stream.
     failed : collections.Counter
         Packets without a position, and defects.
     """
@@ -174,6 +176,7 @@ class MqttSession:
     stream: SilabsStream
     answer: Answer
     on_message: Callable[[MessageOutcome], None] = lambda outcome: None
+    site: Callable[[], SiteInfo] | None = None
     failed: Counter[str] = field(default_factory=Counter)
 
     async def run(self, broker: Broker, *, on_connection: Callable[[bool], None], patient: bool = False) -> None:
@@ -234,6 +237,8 @@ class MqttSession:
     def _receive(self, topic: str, payload: bytes) -> list[Adapted]:
         passed_over, repeated = self.stream.num_passed_over, self.stream.num_repeated
         try:
+            if self.site is not None:
+                self.stream.follow(self.site())
             reports = self.stream.receive(topic, payload, monotonic())
         except Exception:
             self.failed["defect"] += 1

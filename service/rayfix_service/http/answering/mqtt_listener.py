@@ -65,7 +65,6 @@ async def listen(source: MqttSource, state: BrokerState, tables: Tables, answere
             try:
                 with metrics.reports.timed("mqtt"):
                     table = tables.named(source.table)
-                    stream.follow(table.site)
                     incoming = foreign(with_confidence(adapted, settings.confidence))
                     return await answerer.answer(table, incoming, options)
             except ProblemError as error:  # too busy, too slow, or the table is gone
@@ -75,8 +74,20 @@ async def listen(source: MqttSource, state: BrokerState, tables: Tables, answere
             state.set(connected)
             metrics.broker_connected(state.address, connected)
 
-        stream = angle_stream(await _site(source, tables), settings)
-        session = MqttSession(settings=settings, stream=stream, answer=answer, on_message=metrics.broker_message)
+        def site() -> SiteInfo:
+            try:
+                return tables.named(source.table).site
+            except ProblemError:  # the answer to a packet says so
+                return first
+
+        first = await _site(source, tables)
+        session = MqttSession(
+            settings=settings,
+            stream=angle_stream(first, settings),
+            answer=answer,
+            on_message=metrics.broker_message,
+            site=site,
+        )
         try:
             await session.run(source.broker, on_connection=connection_changed, patient=True)
         finally:

@@ -3,18 +3,25 @@
 import asyncio
 import json
 import re
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import psutil
 import pytest
 
-from rayfix.cli import main
-from rayfix_service.adapters.mqtt.settings import MqttSettings, MqttSource
+from rayfix.cli import main, make_parser
+from rayfix.commands.broker import mqtt_source
+from rayfix_service.adapters.adapted import Adapted
+from rayfix_service.adapters.mqtt.session import MqttSession, angle_stream
+from rayfix_service.adapters.mqtt.settings import Broker, MqttSettings, MqttSource
+from rayfix_service.fusion.measurements.report import Height
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.server.app import create_app
+from rayfix_tables.site import SiteInfo, Station
 from tests.support.mqtt_broker import MESSAGE, TAG, Mosquitto, angles, broker_in, exchange
 from tests.support.reports import REPORT
 from tests.support.running_app import serving, until_ready
@@ -144,3 +151,80 @@ def test_what_cannot_work_is_refused_before_the_service_listens(
     last = capsys.readouterr().err.strip().splitlines()[-1]
     assert last.startswith("rayfix: ")
     assert words in last
+
+
+def test_the_options_are_those_of_the_command_of_its_own(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("RAYFIX_MQTT_PASSWORD", "secret")
+    words = (
+        "serve tables --mqtt broker --mqtt-table hall --mqtt-topic a/+/+ --mqtt-publish b/{target_id} "
+        "--mqtt-output omlox --mqtt-station x=bs1 --mqtt-station y=bs2 --mqtt-height 1.2 0.1 "
+        "--mqtt-confidence 0.9 --mqtt-window 0.1 --mqtt-frame north --mqtt-tls --mqtt-username rayfix"
+    )
+    parser = make_parser()
+    assert mqtt_source(parser.parse_args([*words.split(), "--track"])) == MqttSource(
+        broker=Broker(host="broker", port=8883, username="rayfix", password="secret", tls=True),
+        settings=MqttSettings(
+            topic="a/+/+",
+            publish="b/{target_id}",
+            output="omlox",
+            stations={"x": "bs1", "y": "bs2"},
+            height=Height(z=1.2, stdev=0.1),
+            confidence=0.9,
+            window=0.1,
+            frame="north",
+            track=True,
+        ),
+        table="hall",
+    )
+    monkeypatch.delenv("RAYFIX_MQTT_PASSWORD")
+    plain = parser.parse_args(["serve", "tables", "--mqtt", "broker"])
+    assert mqtt_source(plain) == MqttSource(broker=Broker(host="broker"))
+    assert mqtt_source(parser.parse_args(["serve", "tables", "--track"])) is None
+    # Whatever the other command can be told, this one can.
+    own, served = (
+        {option for action in command._actions for option in action.option_strings}
+        for name, command in parser._subparsers._group_actions[0].choices.items()  # type: ignore[union-attr]
+        if name in ("mqtt", "serve")
+    )
+    if "--mqtt" in own:
+        own, served = served, own
+    common = {"-h", "--help", "--omlox-hub", "--broker"}
+    assert {option.replace("--", "--mqtt-", 1) for option in own - common} <= served
+
+
+def test_the_stations_are_those_of_the_table_that_is_served_now():
+    """Of a new table with other stations, or the first message would never be read."""
+
+    async def no_answer(adapted: Adapted) -> dict[str, Any]:
+        raise AssertionError
+
+    def site_of(*names: str) -> SiteInfo:
+        stations = tuple(Station(id=name, position=(0.0, 0.0, 0.0)) for name in names)
+        return SiteInfo(name="site", north=0.0, max_path_length=100.0, stations=stations)
+
+    served, outcomes = [site_of("a")], list[str]()
+    settings = MqttSettings()
+    session = MqttSession(
+        settings=settings,
+        stream=angle_stream(served[0], settings),
+        answer=no_answer,
+        on_message=outcomes.append,
+        site=lambda: served[0],
+    )
+    payload = json.dumps(angles()[0][1]).encode()
+    assert session._receive("x/b/tag", payload) == []
+    served[0] = site_of("b", "c")
+    assert session._receive("x/b/tag", payload) == []  # waits for c
+    assert session._receive("x/b/tag", payload) == []  # the same once more
+    (adapted,) = session._receive("x/c/tag", payload)
+    assert {measurement.station_id for measurement in adapted.report.measurements} == {"b", "c"}
+    assert outcomes == ["passed_over", "taken", "repeated", "taken"]
+
+
+def test_without_the_extra_the_service_says_which(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], hall_table_path: Path
+):
+    monkeypatch.delitem(sys.modules, "rayfix_service.adapters.mqtt.session", raising=False)
+    monkeypatch.setitem(sys.modules, "aiomqtt", None)
+    assert main(["serve", str(hall_table_path), "--mqtt", "localhost"]) == 2
+    assert "'aiomqtt' is not installed; install it with: pip install 'rayfix[mqtt]'" in capsys.readouterr().err
