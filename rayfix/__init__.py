@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from rayfix.client import AsyncClient as AsyncClient
     from rayfix.client import Client as Client
     from rayfix.client import RetryPolicy as RetryPolicy
-    from rayfix_service.adapters.mqtt import BrokerError as BrokerError
+    from rayfix_service.adapters.mqtt.settings import BrokerError as BrokerError
     from rayfix_service.adapters.omlox_hub import HubError as HubError
     from rayfix_service.fusion.measurements.report import GAUSSIAN as GAUSSIAN
     from rayfix_service.fusion.measurements.report import HEAVY_TAILED as HEAVY_TAILED
@@ -194,7 +194,7 @@ _LAZY = {
     ),
     ("rayfix_service.measuring.impulse_response", "service"): ("range_from_impulse_response",),
     ("rayfix_service.http.errors", "service"): ("ServiceError",),
-    ("rayfix_service.adapters.mqtt", "mqtt"): ("BrokerError",),
+    ("rayfix_service.adapters.mqtt.settings", "mqtt"): ("BrokerError",),
     ("rayfix_service.adapters.omlox_hub", "mqtt"): ("HubError",),
     ("rayfix.api", "offline"): ("build",),
     ("rayfix.client", "client"): ("AsyncClient", "Client", "RetryPolicy"),

@@ -23,7 +23,7 @@
     │   └── ProblemError            a problem document (RFC 9457): kind, status, errors
     │       └── RefusedReportError  that of a report
     ├── ServiceError                ``rayfix serve`` cannot start with its settings
-    ├── BrokerError                 ``rayfix mqtt``: the MQTT broker
+    ├── BrokerError                 ``rayfix mqtt``, ``serve --mqtt``: the broker
     ├── HubError                    the address of an omlox hub
     └── ViewError                   ``rayfix view``: the page cannot be written
 

@@ -6,7 +6,8 @@ import signal
 from pathlib import Path
 
 from rayfix_service.adapters.adapted import check_stations
-from rayfix_service.adapters.mqtt import Broker, MqttSettings, check_settings, run_mqtt
+from rayfix_service.adapters.mqtt.session import check_settings, run_mqtt
+from rayfix_service.adapters.mqtt.settings import Broker, MqttSettings
 from rayfix_service.locator import Locator
 from rayfix_service.process_wide import logged_to_stderr
 from rayfix_tables.checked import open_checked

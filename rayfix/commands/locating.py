@@ -13,10 +13,10 @@ from rayfix.commands.arguments import (
     at_least_one,
     hub_settings,
 )
+from rayfix.commands.broker import PASSWORD_VARIABLE
 from rayfix.extras import needs_extra
 
 _INPUTS = ("native", "nrppa", "silabs", "ublox")
-_PASSWORD_VARIABLE = "RAYFIX_MQTT_PASSWORD"  # not an argument, which other users of the machine could read
 
 
 def add_commands(add: AddCommand) -> None:
@@ -66,7 +66,7 @@ def add_commands(add: AddCommand) -> None:
     mqtt.add_argument(
         "--payload-kib", type=at_least_one, default=64, metavar="N", help="longest message, KiB (default: 64)"
     )
-    mqtt.add_argument("--username", help=f"the password is taken from the environment variable {_PASSWORD_VARIABLE}")
+    mqtt.add_argument("--username", help=f"the password is taken from the environment variable {PASSWORD_VARIABLE}")
 
 
 def _locate(options: argparse.Namespace) -> int:
@@ -105,12 +105,12 @@ def _mqtt(options: argparse.Namespace) -> int:
     with needs_extra("mqtt"):
         from rayfix.mqtt import serve_mqtt
         from rayfix_service.adapters.adapted import known_height, station_map
-        from rayfix_service.adapters.mqtt import MqttSettings, parse_broker
+        from rayfix_service.adapters.mqtt.settings import MqttSettings, parse_broker
     broker = parse_broker(
         options.broker,
         tls=options.tls,
         username=options.username,
-        password=os.environ.get(_PASSWORD_VARIABLE),
+        password=os.environ.get(PASSWORD_VARIABLE),
     )
     settings = MqttSettings(
         topic=options.topic,

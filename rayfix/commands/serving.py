@@ -13,6 +13,7 @@ from rayfix.commands.arguments import (
     web_origin,
     web_prefix,
 )
+from rayfix.commands.broker import add_service_broker_arguments, mqtt_source
 from rayfix.extras import needs_extra
 
 
@@ -25,7 +26,9 @@ def add_commands(add: AddCommand) -> None:
     serve.add_argument("--workers", type=int, default=1, help="processes that answer (default: 1)")
     serve.add_argument("--log-format", choices=("text", "json"), default="text", help="of the log (default: text)")
     serve.add_argument("--access-log", action="store_true", help="log a line per request")
-    serve.add_argument("--track", action="store_true", help="follow targets unless a request says otherwise")
+    serve.add_argument(
+        "--track", action="store_true", help="follow targets unless a request says otherwise; with one worker"
+    )
     add_hub_argument(serve)
     serve.add_argument(
         "--allow-simulation",
@@ -82,6 +85,7 @@ def add_commands(add: AddCommand) -> None:
         metavar="MB",
         help="memory that the check of a table may take, besides three times its size (default: 256)",
     )
+    add_service_broker_arguments(serve)
     _add_limit_arguments(serve)
     _add_message_arguments(serve)
 
@@ -182,6 +186,7 @@ def _serve(options: argparse.Namespace) -> int:
             feed_limits=FeedLimits(listeners=options.listeners, backlog_bytes=options.backlog_kib << 10),
             track=options.track,
             hub=hub_settings(options),
+            mqtt=mqtt_source(options),
             table_check=CheckLimits(seconds=options.check_seconds, memory=round(options.check_memory_mb * 1e6)),
             simulation=options.allow_simulation or is_loopback(options.host),
         ),

@@ -18,12 +18,14 @@ undone at its end. Only the limit of open files stays raised. It ends by an exce
 import gc
 import logging
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 __all__ = ["collector_paused", "logged_to_stderr", "logging_restored"]
 
-_FORMAT = "%(levelname)s: %(message)s"
+_FORMAT = "%(asctime)s.%(msecs)03dZ %(levelname)s: %(message)s"
+_DATE_FORMAT = "%Y-%m-%dT%H:%M:%S"
 
 _lock = threading.Lock()
 _pauses = 0
@@ -54,13 +56,18 @@ def collector_paused() -> Iterator[None]:
 
 @contextmanager
 def logged_to_stderr() -> Iterator[None]:
-    """Log messages from the level INFO on to standard error, unless the process has a log of its own."""
+    """Log messages from the level INFO on to standard error, unless the process has a log of its own.
+
+    A line begins with its time in UTC.
+    """
     root = logging.getLogger()
     if root.handlers:
         yield
         return
     handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter(_FORMAT))
+    formatter = logging.Formatter(_FORMAT, _DATE_FORMAT)
+    formatter.converter = time.gmtime
+    handler.setFormatter(formatter)
     level = root.level
     root.addHandler(handler)
     root.setLevel(logging.INFO)

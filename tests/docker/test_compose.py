@@ -6,15 +6,20 @@ import re
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from imagetest.composition import HONOURED, WITHOUT_ENGINE, Composition
 from rayfix.cli import make_parser
-from rayfix_service.fusion.posterior.fix import Status
+from rayfix_service.fusion.measurements.report import Angle, Range, Report
+from rayfix_service.fusion.posterior.fix import Candidate, Fix, Outcome, Status
 from rayfix_service.http.access.keys import ApiKeys
 from rayfix_service.http.telemetry.metrics import Metrics
+from rayfix_service.http.telemetry.report_figures import ReportOutcome
+from rayfix_service.http.telemetry.station_figures import OUTCOMES
+from rayfix_tables.site import SiteInfo, Station
 from tests.support.checkout import ROOT
 
 DOCKER = ROOT / "docker"
@@ -98,6 +103,21 @@ def figures() -> dict[str, set[str]]:
     metrics = Metrics()
     metrics.request_done("/v1/positions", "POST", "200", 0.01)
     metrics.request_done("/v1/positions", "POST", "503", 0.01)
+    measured = (
+        Angle(station_id="a", azimuth=0.0, azimuth_stdev=0.1),
+        Range(station_id="a", path_length=1.0, stdev=0.1),
+    )
+    fix = Fix(
+        status="ok",
+        candidates=(Candidate(probability=1.0, position=np.ones(3), covariance=np.eye(3)),),
+        outcomes=(Outcome(used=True, outlier_probability=0.1),) * 2,
+        log_evidence=0.0,
+        table_id="",
+    )
+    station = Station(id="a", position=(0.0, 0.0, 0.0))
+    site = SiteInfo(name="site", north=0.0, max_path_length=100.0, stations=(station,))
+    metrics.fix_done(fix, 0.01, table="site", site=site, report=Report(measurements=measured))
+    metrics.broker_connected("broker:1883", True)
     text, _ = metrics.exposition("text/plain")
     found: dict[str, set[str]] = {"up": {"job", "instance"}}
     for family in text_string_to_metric_families(text.decode()):
@@ -125,8 +145,20 @@ def test_alerts_and_panels_ask_for_figures_that_are_there(expression: str, figur
             assert label in figures[name]
             if label == "status" and name == "rayfix_fixes_total":
                 assert value in get_args(Status)
+            if label == "outcome":
+                known = get_args(ReportOutcome) if name == "rayfix_reports_total" else (*OUTCOMES, "loaded", "refused")
+                assert set(value.split("|")) <= set(known)
     for labels in re.findall(r"\bby \(([^)]*)\)", expression):
         assert {label.strip() for label in labels.split(",")} <= set.union(*(figures[name] for name, _ in asked))
+
+
+def test_what_is_asked_of_single_routes_is_asked_of_all():
+    """Batches and streams are answered 200 whatever becomes of their reports, and the broker has no route."""
+    assert not any("route=" in expression for expression in expressions())
+    alerts = yaml.safe_load((DOCKER / "prometheus/alerts.yml").read_text(encoding="utf-8"))
+    by_name = {rule["alert"]: rule["expr"] for group in alerts["groups"] for rule in group["rules"]}
+    for name in ("RayfixReportsFail", "RayfixReportsRefused", "RayfixSlow"):
+        assert "by (instance, source" in by_name[name]
 
 
 def test_prometheus_reads_alerts_and_key(services: dict[str, Any]):

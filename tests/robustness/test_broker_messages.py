@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rayfix_service.adapters.mqtt import BrokerError, MqttSettings, check_settings, topic_for
+from rayfix_service.adapters.mqtt.session import check_settings, topic_for
+from rayfix_service.adapters.mqtt.settings import BrokerError, MqttSettings
 from rayfix_service.adapters.silabs_stream import PAYLOAD_BYTES, SilabsStream
 from rayfix_service.locator import Locator
 from rayfix_service.wire.names import MAX_NAME, in_log, topic_level

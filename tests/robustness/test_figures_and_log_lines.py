@@ -1,6 +1,7 @@
 """What a client sends cannot spoil the figures or forge the log."""
 
 import io
+import json
 import logging
 import re
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from rayfix_service.http.telemetry.logs import TextFormatter, log_config
+from tests.support.reports import REPORT
 from tests.support.running_app import RunningApp
 from tests.support.server_process import start_server
 
@@ -29,11 +31,16 @@ def test_web_sockets_are_counted(hall_table_path: Path, tmp_path: Path):
         with connect(f"{url}/stream") as socket:
             assert socket.response is not None
             assert socket.response.headers["x-request-id"]
+            for text in (json.dumps(REPORT), "{}", "x" * (3 << 19)):  # the last one is too long to be read
+                socket.send(text)
+                json.loads(socket.recv())
             for path, origin in (("/stream?output=morse", ""), ("/nothing", ""), ("/stream", "https://evil.example")):
                 with pytest.raises(InvalidStatus) as refusal:
                     connect(f"{url}{path}", additional_headers={"Origin": origin} if origin else {})
                 assert origin == "" or refusal.value.response.headers["x-request-id"]
             figures = http.get("/metrics").text
+    assert 'rayfix_reports_total{outcome="answered",source="stream"} 1.0' in figures
+    assert 'rayfix_reports_total{outcome="refused",source="stream"} 2.0' in figures
     for route, status in (("/v1/stream", 101), ("/v1/stream", 422), ("none", 403)):
         found = re.findall(
             rf'rayfix_http_requests_total{{method="GET",route="{route}",status="{status}"}} (\S+)', figures
@@ -73,6 +80,13 @@ def test_any_message_is_one_line_of_text():
     record = logging.LogRecord("x", logging.INFO, "", 1, "refused: %s", (text,), None)
     assert formatter.format(record) == "INFO:     refused: table a\\nINFO: b\\x1b[31m \\u2028 \\u202e caf\u00e9"
     assert log_config("text", access_log=False)["formatters"]["default"]["()"].endswith("TextFormatter")
+
+
+def test_a_line_of_text_has_its_time():
+    form = log_config("text", access_log=False)["formatters"]["default"]["fmt"]
+    record = logging.LogRecord("x", logging.WARNING, "", 1, "text", (), None)
+    record.created = 1769853600.25
+    assert TextFormatter(form, use_colors=False).format(record) == "2026-01-31T10:00:00.250Z WARNING:  text"
 
 
 @pytest.mark.parametrize(

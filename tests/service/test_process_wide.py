@@ -4,6 +4,7 @@ import gc
 import logging
 import logging.config
 import os
+import re
 import signal
 import sys
 import threading
@@ -117,7 +118,7 @@ def test_a_log_is_shown_only_meanwhile_and_not_beside_that_of_the_host(capsys: p
     finally:
         root.handlers[:] = handlers
         root.setLevel(level)
-    assert capsys.readouterr().err == "INFO: shown\n"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z INFO: shown\n", capsys.readouterr().err)
 
 
 def test_logging_is_as_before_whatever_configures_it_meanwhile() -> None:

@@ -15,7 +15,8 @@ from typing import Any
 import aiomqtt
 import pytest
 
-from rayfix_service.adapters.mqtt import Broker, MqttSettings, run_mqtt
+from rayfix_service.adapters.mqtt.session import run_mqtt
+from rayfix_service.adapters.mqtt.settings import Broker, MqttSettings
 from rayfix_service.http.openapi.examples import SILABS_EXAMPLES
 from rayfix_service.locator import Locator
 

@@ -64,6 +64,7 @@ class SilabsStream:
         height: Height | None = None,
         payload_bytes: int = PAYLOAD_BYTES,
     ) -> None:
+        self._site = site
         self._known = {station.id for station in site.stations}
         self._joiner: Joiner[tuple[datetime, SilabsAngle]] = Joiner(
             window=window, num_stations=len(self._known), repeats=_same_angle, most=_MOST_PACKETS
@@ -80,6 +81,13 @@ class SilabsStream:
     def num_repeated(self) -> int:
         """Messages that were delivered twice."""
         return self._joiner.num_repeated
+
+    def follow(self, site: SiteInfo) -> None:
+        """Take messages of the stations of this site from now on."""
+        if site is not self._site:
+            self._site = site
+            self._known = {station.id for station in site.stations}
+            self._joiner.expect(len(self._known))
 
     def receive(self, topic: str, payload: bytes, now: float) -> list[Adapted]:
         """Take a message that arrived at `now`, s of any clock; returns the reports that it completes."""

@@ -81,6 +81,10 @@ class Joiner(Generic[T]):
         """Transmissions that wait for more stations."""
         return len(self._open)
 
+    def expect(self, num_stations: int) -> None:
+        """Set how many stations there are from now on."""
+        self._num_stations = num_stations
+
     def add(self, target: str, station: str, sequence: int | None, message: T, now: float) -> list[Transmission[T]]:
         """Take a message that arrived at `now`, s; returns the transmissions that it ends."""
         ended = self.due(now)
@@ -101,7 +105,7 @@ class Joiner(Generic[T]):
                 self._dues = [due for due in self._dues if self._open.get(due[2]) is due[3]]
                 heapq.heapify(self._dues)
         transmission.heard[station] = message
-        if len(transmission.heard) == self._num_stations:
+        if self._num_stations is not None and len(transmission.heard) >= self._num_stations:
             ended.append(self._end(key, now))
         elif self._most is not None and len(self._open) > self._most:
             ended.append(self._end(next(iter(self._open)), now))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from starlette.datastructures import State
 from starlette.requests import HTTPConnection
 
+from rayfix_service.http.answering.broker_state import BrokerState
 from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.feed_relay import FeedRelay
 from rayfix_service.http.answering.locating import Answerer
@@ -35,6 +36,8 @@ class Services:
         Tells listeners of fixes.
     relay : FeedRelay or None
         Passes fixes between the workers of one service; None for a single process.
+    broker : BrokerState or None
+        Whether the MQTT broker is connected; None for a service that reads none.
     """
 
     settings: ServiceSettings
@@ -45,6 +48,7 @@ class Services:
     table_cache: TableCache
     feed: FixFeed
     relay: FeedRelay | None
+    broker: BrokerState | None = None
 
 
 def set_services(state: State, services: Services) -> None:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rayfix_service.adapters.mqtt.settings import MqttSource
 from rayfix_service.adapters.omlox_hub import HubSettings
 from rayfix_service.wire.limits import MessageLimits
 from rayfix_tables.checked import CheckLimits
@@ -98,6 +99,8 @@ class ServiceSettings:
         Whether targets are followed by default, where the request has no parameter for it.
     hub : HubSettings, optional
         Omlox hub that all positions are sent to.
+    mqtt : MqttSource, optional
+        MQTT broker whose packets are located, by one of the workers.
     simulation : bool
         Whether ``POST /v1/simulations`` answers.
     own_process : bool
@@ -126,6 +129,12 @@ class ServiceSettings:
     table_check: CheckLimits = field(default_factory=CheckLimits)
     track: bool = False
     hub: HubSettings | None = None
+    mqtt: MqttSource | None = None
     simulation: bool = False
     own_process: bool = False
     runtime_folder: Path | None = None
+
+    @property
+    def has_several_workers(self) -> bool:
+        """Whether the process is one of several that answer for one service."""
+        return self.runtime_folder is not None

@@ -22,6 +22,7 @@ from rayfix_service.http.access.guard import Access, describe_access
 from rayfix_service.http.access.keys import ApiKeys
 from rayfix_service.http.access.prefix import Prefix
 from rayfix_service.http.access.rates import Accounts, RateLimit
+from rayfix_service.http.answering.broker_state import BrokerState
 from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.feed_relay import FeedRelay
 from rayfix_service.http.answering.locating import Answerer
@@ -163,6 +164,9 @@ def create_app(
         slow_work = SlowWork(
             threads=settings.slow_fix_threads, waiting=settings.slow_fixes_waiting, seconds=settings.fix_seconds
         )
+        broker = None
+        if settings.mqtt is not None:
+            broker = BrokerState(settings.mqtt.broker.address, settings.runtime_folder)
         stopping = asyncio.Event()
 
         def stop() -> None:
@@ -189,12 +193,14 @@ def create_app(
                         table_cache=TableCache(),
                         feed=feed,
                         relay=relay,
+                        broker=broker,
                     )
                     set_services(app.state, services)
                     if settings.runtime_folder is not None:
                         forget_dead_workers()
                         await _take_turn(tables, settings.runtime_folder / "ready", stopping)
-                    yield {NOTE: metrics.connection_closed}
+                    async with _broker_read(services):
+                        yield {NOTE: metrics.connection_closed}
         finally:
             stop()
             for task in keeping:
@@ -260,6 +266,30 @@ async def _keep_keys(keys: ApiKeys, seconds: float) -> None:
                 _log.error("keys not read again: %s", error)
         else:
             failure = ""
+
+
+@asynccontextmanager
+async def _broker_read(services: Services) -> AsyncIterator[None]:
+    """Read the service's MQTT broker meanwhile, if it has one and no other worker does."""
+    source, state = services.settings.mqtt, services.broker
+    if source is None or state is None:
+        yield
+        return
+    # Imported here, since it needs an extra that a service without a broker may lack.
+    from rayfix_service.http.answering.mqtt_listener import listen
+
+    async def read() -> None:
+        try:
+            await listen(source, state, services.tables, services.answerer)
+        except Exception:  # what is asked by HTTP is answered all the same
+            _log.critical("the MQTT broker is no longer read", exc_info=True)
+
+    reading = asyncio.create_task(read())
+    try:
+        yield
+    finally:
+        reading.cancel()
+        await asyncio.wait([reading])
 
 
 async def _freeze(tables: Tables) -> None:

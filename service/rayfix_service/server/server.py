@@ -42,8 +42,8 @@ _SHUTDOWN_SECONDS = 10  # for requests under way; a full batch takes about one
 _ARRIVING_SECONDS = 0.2  # for requests that are on the way to this process when it is to end
 
 _TRACKS = (
-    "each of the %d workers follows targets by itself, and the system chooses who answers a connection: a target's "
-    "reports belong on one connection; else serve with one worker on each of several ports, balanced by target_id"
+    "track is set with {} workers, among which a target's reports would be split; follow targets with one worker, or "
+    "with one on each of several ports, balanced by target_id (docs/tracking.md)"
 )
 
 _NO_VIEWER = "this installation is without the viewer; / says how to get it, and /docs is a page without scripts"
@@ -90,13 +90,17 @@ def serve(
     TableError
         When no table is whole: missing, of another format, or damaged. Where others are whole, these are served.
     ServiceError
-        When no worker can start, the port is taken, an argument is out of range, the keys are missing, or the folder
-        for figures cannot be written to.
+        When no worker can start, the port is taken, an argument is out of range, the keys are missing, the folder for
+        figures cannot be written to, or several workers are to follow targets.
+    BrokerError, ReportError
+        When the settings of the MQTT broker cannot be used with the table.
     """
     path = Path(tables_path).absolute()
     settings = replace(settings or ServiceSettings(), own_process=True)
     if workers < 1:
         raise ServiceError(f"workers is {workers}; give at least 1")
+    if workers > 1 and settings.track:
+        raise ServiceError(_TRACKS.format(workers))
     if settings.api_keys is not None:
         read_key_file(settings.api_keys)
     elif not is_loopback(host):
@@ -136,12 +140,15 @@ def serve(
         at_hand.update(load_tables(path, checks=checks))  # with logging as configured: kernels may be compiled
         if not viewer_is_built():
             _log.warning(_NO_VIEWER)
+        if settings.mqtt is not None:
+            # Imported here, since it needs an extra that a service without a broker may lack.
+            from rayfix_service.http.answering.mqtt_listener import check_source
+
+            check_source(settings.mqtt, at_hand)
         if workers == 1:
             with suppress(KeyboardInterrupt):
                 _run(config)
             return
-        if settings.track:
-            _log.warning(_TRACKS, workers)
         gc.collect()
         gc.freeze()  # a collection would write to the common memory of the workers, and so copy it
         stack.callback(gc.unfreeze)

@@ -17,7 +17,8 @@ import pytest
 
 from rayfix.cli import main
 from rayfix_service.adapters.formats import write
-from rayfix_service.adapters.mqtt import Broker, BrokerError, MqttSettings, check_settings, parse_broker
+from rayfix_service.adapters.mqtt.session import check_settings
+from rayfix_service.adapters.mqtt.settings import Broker, BrokerError, MqttSettings, parse_broker
 from rayfix_service.adapters.omlox_hub import HubSettings
 from rayfix_service.adapters.silabs import parse_silabs
 from rayfix_service.adapters.silabs_stream import SilabsStream
@@ -276,7 +277,7 @@ def test_a_hub_that_is_no_address_is_one_line(
 def test_without_the_extra_the_command_says_which(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], hall_table_path: Path
 ):
-    for name in ("rayfix.mqtt", "rayfix_service.adapters.mqtt"):
+    for name in ("rayfix.mqtt", "rayfix_service.adapters.mqtt.session"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     monkeypatch.setitem(sys.modules, "aiomqtt", None)
     assert main(["mqtt", str(hall_table_path)]) == 2

@@ -25,7 +25,7 @@ class Fused:
         Of the position, with which the hypotheses' Gaussians are multiplied.
     likelihood : Hypotheses or None
         The same without what is known of the height: from a product with a uniform prior of its own, since dividing the
-        height out of merged hypotheses leaves precisions that are not positive.
+        height out of merged hypotheses leaves precisions that are not positive. None where it was not asked for.
     """
 
     fix: Fix

@@ -23,6 +23,7 @@ from rayfix_service.http.answering.slow_work import SlowWork
 from rayfix_service.http.problems import ProblemError, internal_problem, problem_document, report_problem
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.telemetry.metrics import Metrics
+from rayfix_service.http.telemetry.report_figures import Source, report_outcome
 from rayfix_service.locator import Locator
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report, report_to_document
@@ -167,9 +168,10 @@ class Answerer:
         quick = locator.seconds(report) <= self.quick_seconds
         start = perf_counter()
         try:
-            fused = locator.fuse(report, stop=NEVER) if quick else await self.slow_work.locate(locator.fuse, report)
+            fuse = partial(locator.fuse, with_likelihood=options.follows(report))
+            fused = fuse(report, stop=NEVER) if quick else await self.slow_work.locate(fuse, report)
             seconds = perf_counter() - start
-            self.metrics.fix_done(fused.fix, seconds)
+            self.metrics.fix_done(fused.fix, seconds, table=table.name, site=table.site, report=report)
             track = table.tracker.follow(fused) if options.follows(report) else None
         except ReportError as error:
             if incoming.adapted is None:
@@ -212,13 +214,23 @@ class Answerer:
             answer["report"] = incoming.native_document()
         return answer
 
+    def unread(self, error: Exception, source: Source) -> dict[str, Any]:
+        """Write the problem of one report of several that cannot be read, and count it."""
+        self.metrics.reports.done(source, report_outcome(error))
+        return problem_of(error)
+
     async def answer_or_problem(
-        self, table: ServedTable, make: Callable[[], Incoming | Awaitable[Incoming]], options: ResponseOptions
+        self,
+        table: ServedTable,
+        make: Callable[[], Incoming | Awaitable[Incoming]],
+        options: ResponseOptions,
+        source: Source,
     ) -> dict[str, Any]:
-        """Answer one report of several, with a problem where it cannot be used."""
+        """Answer one report of several, with a problem where it cannot be used, and count it."""
         try:
-            made = make()
-            return await self.answer(table, made if isinstance(made, Incoming) else await made, options)
+            with self.metrics.reports.timed(source):
+                made = make()
+                return await self.answer(table, made if isinstance(made, Incoming) else await made, options)
         except Exception as error:
             return problem_of(error)
 

@@ -8,7 +8,9 @@ from starlette.types import Scope
 from rayfix_service.adapters.formats import OutputFormat
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.http.headers import header
+from rayfix_service.http.problems import INVALID_PARAMETER, ProblemError
 from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.wire import FieldProblem
 
 JSON = "application/json"
 
@@ -18,6 +20,12 @@ MEDIA_TYPES: dict[str, OutputFormat] = {
     "application/vnd.rayfix.omlox+json": "omlox",
 }
 """Media types by which an Accept header names a format."""
+
+
+NO_TRACKS = (
+    "track is true and this service has several workers, among which a target's reports would be split; serve with one "
+    "worker, or one on each of several ports, balanced by target_id"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +59,15 @@ class ResponseOptions:
 def response_options_of(
     scope: Scope, settings: ServiceSettings, output: OutputFormat | None = None, track: bool | None = None
 ) -> ResponseOptions:
-    """Read the options of a request from its query, else from its Accept header and the service's settings."""
+    """Read the options of a request from its query, else from its Accept header and the service's settings.
+
+    Raises
+    ------
+    ProblemError
+        When targets are to be followed by one of several workers, each of which would have tracks of its own.
+    """
+    if track and settings.has_several_workers:
+        raise ProblemError(INVALID_PARAMETER, NO_TRACKS, errors=(FieldProblem(path=("track",), message=NO_TRACKS),))
     media_type = JSON
     if output is None:
         media_type, output = _accepted(header(scope, b"accept"))

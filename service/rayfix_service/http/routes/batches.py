@@ -9,10 +9,11 @@ from fastapi import Request
 
 from rayfix_service.http.access.guard import charge_reports
 from rayfix_service.http.answering.cooperative import Cooperation
-from rayfix_service.http.answering.locating import Answerer, Incoming, problem_of
+from rayfix_service.http.answering.locating import Answerer, Incoming
 from rayfix_service.http.answering.response_options import ResponseOptions
 from rayfix_service.http.answering.served_tables import ServedTable
 from rayfix_service.http.routes.json_answer import JsonAnswer, results_answer, write_json
+from rayfix_service.http.telemetry.report_figures import Source
 from rayfix_service.wire import MalformedJsonError
 from rayfix_service.wire.batches import split_batch
 from rayfix_service.wire.limits import MessageLimits
@@ -22,7 +23,13 @@ ReadOne = Callable[[bytes, MessageLimits], Incoming]
 
 
 async def answer_batch(
-    request: Request, answerer: Answerer, table: ServedTable, body: bytes, options: ResponseOptions, read_one: ReadOne
+    request: Request,
+    answerer: Answerer,
+    table: ServedTable,
+    body: bytes,
+    options: ResponseOptions,
+    read_one: ReadOne,
+    source: Source,
 ) -> JsonAnswer:
     """Read all reports of a batch, then locate them in their order.
 
@@ -47,7 +54,7 @@ async def answer_batch(
         except MalformedJsonError as error:
             raise MalformedJsonError(f"reports[{number}]: {error}") from None
         except Exception as error:
-            problem = problem_of(error)
+            problem = answerer.unread(error, source)
             if (left_out := len(problem["errors"]) - own.listed_problems) > 0:
                 problem["more_errors"] = problem.get("more_errors", 0) + left_out
                 del problem["errors"][own.listed_problems :]
@@ -57,7 +64,8 @@ async def answer_batch(
     for report in reports:  # not by locate_batch: other batches keep the other workers, one for each core, as busy
         if isinstance(report, Incoming):
             await cooperation.let_others_run()
-            results.append(write_json(await answerer.answer_or_problem(table, partial(_itself, report), options)))
+            answer = await answerer.answer_or_problem(table, partial(_itself, report), options, source)
+            results.append(write_json(answer))
         else:
             results.append(write_json(report))
     return results_answer(results)

@@ -65,7 +65,8 @@ async def post_nrppa(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    return await answer_one(partial(_read_nrppa, limits=answerer.message_limits), body, answerer, table, options)
+    read = partial(_read_nrppa, limits=answerer.message_limits)
+    return await answer_one(read, body, answerer, table, options, "nrppa")
 
 
 @router.post(
@@ -79,7 +80,8 @@ async def post_silabs(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    return await answer_one(partial(_read_silabs, limits=answerer.message_limits), body, answerer, table, options)
+    read = partial(_read_silabs, limits=answerer.message_limits)
+    return await answer_one(read, body, answerer, table, options, "silabs")
 
 
 @router.post(
@@ -93,7 +95,7 @@ async def post_nrppa_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Locate each message on its own; one that cannot be used gets a problem and leaves the others alone."""
-    return await answer_batch(request, answerer, table, body, options, _read_nrppa)
+    return await answer_batch(request, answerer, table, body, options, _read_nrppa, "nrppa_batch")
 
 
 @router.post(
@@ -107,7 +109,7 @@ async def post_silabs_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Locate each packet on its own; one that cannot be used gets a problem and leaves the others alone."""
-    return await answer_batch(request, answerer, table, body, options, _read_silabs)
+    return await answer_batch(request, answerer, table, body, options, _read_silabs, "silabs_batch")
 
 
 def _read_nrppa(text: bytes, limits: MessageLimits) -> Incoming:
@@ -172,5 +174,6 @@ async def post_ublox(
     cooperation = Cooperation(request)
     for adapted in messages:
         await cooperation.let_others_run()
-        results.append(write_json(await answerer.answer_or_problem(table, partial(foreign, adapted), options)))
+        answer = await answerer.answer_or_problem(table, partial(foreign, adapted), options, "ublox")
+        results.append(write_json(answer))
     return results_answer(results)

@@ -6,8 +6,9 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, Field
 
+from rayfix_service.http.answering.broker_state import BrokerConnection
 from rayfix_service.http.problems import NOT_READY, problem_responses
-from rayfix_service.http.routes.dependencies import ServicesDep, TablesDep
+from rayfix_service.http.routes.dependencies import ServicesDep
 
 router = APIRouter(tags=["health"])
 
@@ -25,6 +26,13 @@ class ReadyTable(BaseModel):
     table_id: str = Field(description="SHA-256 of the table's content")
 
 
+class ReadyBroker(BaseModel):
+    """The MQTT broker that the service reads."""
+
+    address: str = Field(description="host and port")
+    connection: BrokerConnection = Field(description="whether one of the workers reads it; a lost one is tried again")
+
+
 class Ready(BaseModel):
     """All tables are checked, at least one answers, and the kernels are compiled."""
 
@@ -34,6 +42,10 @@ class Ready(BaseModel):
         default=[],
         description="names of files that do not pass their check; a table that was loaded before may answer for one",
     )
+    mqtt: ReadyBroker | None = Field(
+        default=None,
+        description="of a service that reads an MQTT broker; without it, requests are answered all the same",
+    )
 
 
 @router.get("/livez", summary="Does the process answer?")
@@ -42,12 +54,16 @@ async def livez() -> Alive:
     return Alive()
 
 
-@router.get("/readyz", summary="Can it locate?", responses=problem_responses(NOT_READY))
-async def readyz(tables: TablesDep) -> Ready:
+@router.get(
+    "/readyz", summary="Can it locate?", responses=problem_responses(NOT_READY), response_model_exclude_none=True
+)
+async def readyz(services: ServicesDep) -> Ready:
     """Answer 200 once all tables are checked and the kernels are compiled, and 503 before."""
+    tables, broker = services.tables, services.broker
     return Ready(
         tables=[ReadyTable(name=t.name, table_id=t.locator.table.table_id) for t in tables.all()],
         refused=list(tables.refused),
+        mqtt=None if broker is None else ReadyBroker(address=broker.address, connection=broker.connection()),
     )
 
 

@@ -1,6 +1,7 @@
 """Routes that locate."""
 
 import asyncio
+from functools import partial
 
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
@@ -22,6 +23,7 @@ from rayfix_service.http.routes.dependencies import (
     read_body,
 )
 from rayfix_service.http.routes.json_answer import JsonAnswer, write_json
+from rayfix_service.http.routes.one_report import answer_one
 from rayfix_service.http.services import services_in
 from rayfix_service.wire import BatchDocument, ReportDocument
 from rayfix_service.wire.limits import MessageLimits
@@ -53,8 +55,8 @@ async def post_position(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
-    incoming = await answerer.read_report(body)
-    return JsonAnswer(await answerer.answer(table, incoming, options), media_type=options.media_type)
+    read = partial(native, limits=answerer.message_limits)
+    return await answer_one(read, body, answerer, table, options, "positions")
 
 
 async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple[bytes, str]:
@@ -68,11 +70,12 @@ async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple
     table = services.tables.named(None)
     body = await read_body(scope, receive, services.settings.body_limits.report)
     options = response_options_of(scope, services.settings)
-    incoming = await answerer.read_report(body)
-    await asyncio.sleep(0)
-    located = await answerer.locate(table, incoming, options)
-    await asyncio.sleep(0)
-    return write_json(answerer.write(table, incoming, options, located)), options.media_type
+    with answerer.metrics.reports.timed("positions"):
+        incoming = await answerer.read_report(body)
+        await asyncio.sleep(0)
+        located = await answerer.locate(table, incoming, options)
+        await asyncio.sleep(0)
+        return write_json(answerer.write(table, incoming, options, located)), options.media_type
 
 
 @router.post(
@@ -86,7 +89,7 @@ async def post_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
-    return await answer_batch(request, answerer, table, body, options, _read_native)
+    return await answer_batch(request, answerer, table, body, options, _read_native, "batch")
 
 
 def _read_native(text: bytes, limits: MessageLimits) -> Incoming:

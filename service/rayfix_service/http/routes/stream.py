@@ -29,6 +29,7 @@ from rayfix_service.http.problems import (
 )
 from rayfix_service.http.routes.dependencies import ResponseOptionsDep, ServicesDep, TableDep
 from rayfix_service.http.services import Services
+from rayfix_service.http.telemetry.report_figures import report_outcome
 from rayfix_service.wire import FixDocument, ReportDocument
 
 router = APIRouter(prefix="/v1", tags=["streams"])
@@ -176,6 +177,7 @@ async def stream(
                 body = await _next_message(websocket)
                 answer: dict[str, Any]
                 if len(body) > limit:
+                    services.metrics.reports.done("stream", "refused")
                     answer = problem_document(
                         BODY_TOO_LARGE, f"the message is longer than {limit} bytes; send fewer measurements at once"
                     )
@@ -198,9 +200,10 @@ async def _answer(services: Services, table: str | None, body: bytes, options: R
     try:
         served = services.tables.named(table)
     except ProblemError as error:
+        services.metrics.reports.done("stream", report_outcome(error))
         return problem_document(error.kind, str(error), error.errors)
     answerer = services.answerer
-    return await answerer.answer_or_problem(served, partial(answerer.read_report, body), options)
+    return await answerer.answer_or_problem(served, partial(answerer.read_report, body), options, "stream")
 
 
 async def _next_message(websocket: WebSocket) -> bytes:

@@ -14,6 +14,7 @@ from rayfix_service.http.telemetry.request_context import ACCESS_LOGGER, REQUEST
 
 LogFormat = Literal["text", "json"]
 
+_TEXT = "%(asctime)s %(levelprefix)s %(message)s"
 
 # Control characters, among them escape sequences of terminals, and what ends a line or turns its direction.
 _UNFIT = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -24,8 +25,18 @@ def on_one_line(text: str) -> str:
     return _UNFIT.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
+def utc_time(record: logging.LogRecord) -> str:
+    """Write the time of a record as UTC with milliseconds, such as ``2026-01-31T10:00:00.250Z``."""
+    time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+    return time.replace("+00:00", "Z")
+
+
 class TextFormatter(DefaultFormatter):
-    """Writes a record as uvicorn does, its message on one line whatever a client had it contain."""
+    """Writes a record as uvicorn does, its time in UTC, its message on one line whatever a client had it contain."""
+
+    def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:  # noqa: N802
+        """Write the time of a record."""
+        return utc_time(record)
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
         """Write one record, without the traceback."""
@@ -42,9 +53,8 @@ class JsonFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Write one record."""
-        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
         entry: dict[str, Any] = {
-            "time": time.replace("+00:00", "Z"),
+            "time": utc_time(record),
             "level": record.levelname,
             "logger": record.name,
             "message": record.getMessage(),
@@ -70,7 +80,7 @@ def log_config(log_format: LogFormat, *, access_log: bool) -> dict[str, Any]:
     if log_format == "json":
         config["formatters"] = {name: {"()": _name_of(JsonFormatter)} for name in config["formatters"]}
     else:
-        config["formatters"]["default"]["()"] = _name_of(TextFormatter)
+        config["formatters"]["default"] |= {"()": _name_of(TextFormatter), "fmt": _TEXT}
     for name in ("rayfix", "rayfix_service"):
         config["loggers"][name] = {"handlers": ["default"], "level": "INFO", "propagate": False}
     config["loggers"][ACCESS_LOGGER] = {"level": "INFO" if access_log else "WARNING"}

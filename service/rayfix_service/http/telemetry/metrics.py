@@ -10,9 +10,13 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.multiprocess import MultiProcessCollector
 
 from rayfix_service.adapters.omlox_hub import HubOutcome
+from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix, Status
 from rayfix_service.http.telemetry.connections import CLOSED, Closed
+from rayfix_service.http.telemetry.report_figures import SECONDS, ReportFigures
+from rayfix_service.http.telemetry.station_figures import OUTCOMES, StationFigures, outcome_name
 from rayfix_service.tracking.track import TrackState
+from rayfix_tables.site import SiteInfo
 from rayfix_tables.table import Table
 
 MULTIPROCESS_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
@@ -26,14 +30,21 @@ _ACCEPTABLE = re.compile(
 """An item of an Accept header that prometheus-client can read; it fails at others."""
 
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
-_SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 
 class Metrics:
-    """The figures of one application, in a registry of its own."""
+    """The figures of one application, in a registry of its own.
+
+    Attributes
+    ----------
+    reports : ReportFigures
+        Reports by the way that they came.
+    """
 
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
+        self.reports = ReportFigures(self._registry)
+        self._stations = StationFigures(self._registry)
         self._requests = Counter(
             "rayfix_http_requests",
             "HTTP requests by route, method and status",
@@ -45,14 +56,14 @@ class Metrics:
             "rayfix_http_request_seconds",
             "Time from a request's head to the end of its answer",
             ("route", "method"),
-            buckets=_SECONDS,
+            buckets=SECONDS,
             registry=self._registry,
         )
         fixes = Counter("rayfix_fixes", "Fixes by status", ("status",), registry=self._registry)
         # All that there can be is there from the start, at 0, so that a rate begins with the first.
         self._fixes = {status: fixes.labels(status) for status in get_args(Status)}
         self._fusion_seconds = Histogram(
-            "rayfix_fusion_seconds", "Time that a fix took to compute", buckets=_SECONDS, registry=self._registry
+            "rayfix_fusion_seconds", "Time that a fix took to compute", buckets=SECONDS, registry=self._registry
         )
         measurements = Counter(
             "rayfix_measurements",
@@ -60,7 +71,7 @@ class Metrics:
             ("outcome",),
             registry=self._registry,
         )
-        self._measurements = {name: measurements.labels(name) for name in ("used", "outlier", "unused")}
+        self._measurements = {name: measurements.labels(name) for name in OUTCOMES}
         tracks = Counter(
             "rayfix_tracks", "Reports by what they did to their target's track", ("state",), registry=self._registry
         )
@@ -72,6 +83,20 @@ class Metrics:
             registry=self._registry,
         )
         self._told = {outcome: told.labels(outcome) for outcome in get_args(HubOutcome)}
+        messages = Counter(
+            "rayfix_mqtt_messages",
+            "Messages of the MQTT broker by what became of them: taken, repeated (delivered twice) or passed over",
+            ("outcome",),
+            registry=self._registry,
+        )
+        self._messages = {outcome: messages.labels(outcome) for outcome in ("taken", "repeated", "passed_over")}
+        self._broker = Gauge(
+            "rayfix_mqtt_connected",
+            "1 while the MQTT broker is connected; absent where none is read",
+            ("broker",),
+            registry=self._registry,
+            multiprocess_mode="livemax",
+        )
         closed = Counter(
             "rayfix_connections_closed",
             "Connections that the service closed by itself, by the reason",
@@ -117,13 +142,26 @@ class Metrics:
         requests.inc()
         request_seconds.observe(seconds)
 
-    def fix_done(self, fix: Fix, seconds: float) -> None:
-        """Count a fix and its measurements."""
+    def fix_done(self, fix: Fix, seconds: float, *, table: str, site: SiteInfo, report: Report) -> None:
+        """Count a fix and its measurements.
+
+        Parameters
+        ----------
+        fix : Fix
+        seconds : float
+            That it took to compute.
+        table : str
+            Name of the table that answered.
+        site : SiteInfo
+            Of that table.
+        report : Report
+            That the fix answers.
+        """
         self._fixes[fix.status].inc()
         self._fusion_seconds.observe(seconds)
         for outcome in fix.outcomes:
-            name = "unused" if not outcome.used else "outlier" if (outcome.outlier_probability or 0) > 0.5 else "used"
-            self._measurements[name].inc()
+            self._measurements[outcome_name(outcome)].inc()
+        self._stations.count(table, site, report, fix)
 
     def track_done(self, state: TrackState) -> None:
         """Count a report that was taken into a track."""
@@ -133,6 +171,14 @@ class Metrics:
         """Count a position for the omlox hub."""
         self._told[outcome].inc()
 
+    def broker_message(self, outcome: str) -> None:
+        """Count a message of the MQTT broker."""
+        self._messages[outcome].inc()
+
+    def broker_connected(self, address: str, connected: bool) -> None:
+        """Tell whether the MQTT broker is connected."""
+        self._broker.labels(address).set(connected)
+
     def connection_closed(self, reason: Closed) -> None:
         """Count a connection that the service closed by itself."""
         self._closed[reason].inc()
@@ -141,6 +187,7 @@ class Metrics:
         """Tell that a table answers."""
         self._table.labels(*_table_labels(name, table)).set(1)
         self._loads["loaded"].inc()
+        self._stations.add_table(name, table.site)
 
     def table_left(self, name: str, table: Table) -> None:
         """Tell that a table does no longer answer."""

@@ -8,22 +8,39 @@ import logging
 import logging.config
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from rayfix_service.fusion.posterior.fix import Fix, Outcome
-from rayfix_service.http.openapi.examples import BATCH_EXAMPLES, UBLOX_EXAMPLES
+from rayfix_service.fusion.measurements.report import Range, Report, TimeDifference
+from rayfix_service.fusion.posterior.fix import Candidate, Fix, Outcome
+from rayfix_service.http.openapi.examples import (
+    BATCH_EXAMPLES,
+    NRPPA_BATCH_EXAMPLES,
+    NRPPA_EXAMPLES,
+    SILABS_BATCH_EXAMPLES,
+    SILABS_EXAMPLES,
+    UBLOX_EXAMPLES,
+)
+from rayfix_service.http.problems import NOT_FOUND, OVERLOADED, ProblemError
 from rayfix_service.http.telemetry.logs import JsonFormatter, log_config
 from rayfix_service.http.telemetry.metrics import Metrics
+from rayfix_service.http.telemetry.report_figures import report_outcome
 from rayfix_service.http.telemetry.request_context import ACCESS_LOGGER, REQUEST_ID, RequestContext
+from rayfix_service.http.telemetry.station_figures import MOST_STATIONS
 from rayfix_service.locator import Locator
+from rayfix_tables.errors import ReportError
+from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table
 from tests.support.checkout import ROOT
 from tests.support.reports import REPORT
 from tests.support.running_app import RunningApp
+
+SITE = SiteInfo(name="site", north=0.0, max_path_length=100.0, stations=(Station(id="a", position=(0.0, 0.0, 0.0)),))
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +87,12 @@ def test_a_report_is_counted(service: RunningApp):
         ("rayfix_fixes_total", "ok"): 1,
         ("rayfix_fusion_seconds_count",): 1,
         ("rayfix_measurements_total", "used"): 2,
+        ("rayfix_reports_total", "answered", "positions"): 1,
+        ("rayfix_report_seconds_count", "positions"): 1,
+        ("rayfix_station_measurements_total", "used", "bs1", "hall"): 2,
+        ("rayfix_station_outlier_probability_total", "bs1", "hall"): pytest.approx(0.0, abs=0.5),
+        ("rayfix_station_angle_residual_degrees_count", "bs1", "hall"): 1,
+        ("rayfix_station_range_residual_meters_count", "bs1", "hall"): 1,
     }
 
 
@@ -83,6 +106,96 @@ def test_each_fix_of_a_batch_is_counted(service: RunningApp):
     text = {"content": lines, "headers": {"content-type": "text/plain"}}
     figures = own(grown(service, lambda: service.request("POST", "/v1/positions/ublox", **text)))
     assert figures["rayfix_measurements_total", "used"] == 3
+
+
+def first(examples: dict[str, Any]) -> Any:
+    return next(iter(examples.values()))["value"]
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "source"),
+    [
+        ("positions", REPORT, "positions"),
+        ("positions?output=native", REPORT, "positions"),
+        ("positions/batch", {"reports": [REPORT]}, "batch"),
+        ("positions/nrppa", first(NRPPA_EXAMPLES), "nrppa"),
+        ("positions/nrppa/batch", first(NRPPA_BATCH_EXAMPLES), "nrppa_batch"),
+        ("positions/silabs", first(SILABS_EXAMPLES), "silabs"),
+        ("positions/silabs/batch", first(SILABS_BATCH_EXAMPLES), "silabs_batch"),
+        ("positions/ublox", first(UBLOX_EXAMPLES), "ublox"),
+    ],
+)
+def test_every_route_that_locates_is_counted(service: RunningApp, path: str, body: Any, source: str):
+    text = body if isinstance(body, str) else json.dumps(body)
+    headers = {"content-type": "text/plain" if isinstance(body, str) else "application/json"}
+    figures = own(grown(service, lambda: service.request("POST", f"/v1/{path}", content=text, headers=headers)))
+    counted = {key: value for key, value in figures.items() if key[0].startswith("rayfix_report")}
+    number = figures["rayfix_fusion_seconds_count",]
+    assert counted == {
+        ("rayfix_reports_total", "answered", source): number,
+        ("rayfix_report_seconds_count", source): number,
+    }
+
+
+def test_reports_that_are_refused_are_counted_one_by_one(service: RunningApp):
+    def act() -> None:
+        service.post("/v1/positions", {"measurements": []})
+        stranger = {**REPORT, "measurements": [{**REPORT["measurements"][0], "station_id": "stranger"}]}
+        answer = service.post("/v1/positions/batch", {"reports": [{"measurements": []}, stranger, REPORT]})
+        assert answer.status_code == 200
+
+    figures = own(grown(service, act))
+    assert {key: value for key, value in figures.items() if key[0] == "rayfix_reports_total"} == {
+        ("rayfix_reports_total", "refused", "positions"): 1,
+        ("rayfix_reports_total", "refused", "batch"): 2,
+        ("rayfix_reports_total", "answered", "batch"): 1,
+    }
+
+
+@pytest.mark.parametrize(
+    ("error", "outcome"),
+    [
+        (None, "answered"),
+        (ReportError("of the sender"), "refused"),
+        (ProblemError(NOT_FOUND, "of the sender"), "refused"),
+        (ProblemError(OVERLOADED, "of the service"), "failed"),
+        (RuntimeError("a defect"), "failed"),
+        (asyncio.CancelledError(), "failed"),
+    ],
+)
+def test_whose_fault_it_is_that_a_report_is_not_answered(error: BaseException | None, outcome: str):
+    assert report_outcome(error) == outcome
+
+
+def test_stations_without_end_are_one():
+    metrics = Metrics()
+    stations = tuple(Station(id=f"s{n}", position=(0.0, 0.0, 0.0)) for n in range(MOST_STATIONS + 50))
+    site = replace(SITE, stations=stations)
+    candidate = Candidate(probability=1.0, position=np.array([3.0, 4.0, 0.0]), covariance=np.eye(3))
+    used = Outcome(used=True, outlier_probability=0.25)
+    for station in stations:
+        report = Report(measurements=(Range(station_id=station.id, path_length=7.0, stdev=1.0),))
+        fix = Fix(status="ok", candidates=(candidate,), outcomes=(used,), log_evidence=0.0, table_id="")
+        metrics.fix_done(fix, 0.003, table="t", site=site, report=report)
+    text = metrics.exposition("")[0].decode()
+    counted = re.findall(r'rayfix_station_measurements_total{outcome="used",station="(\w+)",table="\w+"} (\S+)', text)
+    assert len(counted) == MOST_STATIONS + 1
+    assert dict(counted) == {**{f"s{n}": "1.0" for n in range(MOST_STATIONS)}, "other": "50.0"}
+    assert 'rayfix_station_outlier_probability_total{station="other",table="other"} 12.5\n' in text
+    assert 'rayfix_station_range_residual_meters_bucket{le="1.0",station="s0",table="t"} 0.0\n' in text
+    assert 'rayfix_station_range_residual_meters_bucket{le="2.0",station="s0",table="t"} 1.0\n' in text
+    assert 'rayfix_station_range_residual_meters_sum{station="other",table="other"} 100.0\n' in text
+
+
+def test_a_time_difference_counts_for_both_stations():
+    metrics = Metrics()
+    measured = TimeDifference(station_id="a", reference_station_id="b", length_difference=1.0, stdev=1.0)
+    outcome = Outcome(used=True, outlier_probability=0.9)
+    fix = Fix(status="inconsistent", candidates=(), outcomes=(outcome,), log_evidence=0.0, table_id="")
+    metrics.fix_done(fix, 0.003, table="t", site=SITE, report=Report(measurements=(measured,)))
+    text = metrics.exposition("")[0].decode()
+    for station in "ab":
+        assert f'rayfix_station_measurements_total{{outcome="outlier",station="{station}",table="t"}} 1.0\n' in text
 
 
 @pytest.mark.parametrize(
@@ -101,6 +214,7 @@ def test_refusals_are_counted_by_route_and_not_by_path(
     assert figures == {
         ("rayfix_http_requests_total", method, route, status): 1,
         ("rayfix_http_request_seconds_count", method, route): 1,
+        **({("rayfix_reports_total", "refused", "positions"): 1} if status == "422" else {}),
     }
 
 
@@ -118,12 +232,16 @@ def test_outcomes_of_measurements_are_told_apart():
         Outcome(used=False, reason="why"),
     )
     fix = Fix(status="inconsistent", candidates=(), outcomes=outcomes, log_evidence=0.0, table_id="")
-    metrics.fix_done(fix, 0.003)
+    measured = tuple(Range(station_id="a", path_length=1.0 + n, stdev=1.0) for n in range(4))
+    metrics.fix_done(fix, 0.003, table="t", site=SITE, report=Report(measurements=measured))
     text = metrics.exposition("")[0].decode()
     for line in (
         'rayfix_measurements_total{outcome="used"} 1.0',
         'rayfix_measurements_total{outcome="outlier"} 2.0',
         'rayfix_measurements_total{outcome="unused"} 1.0',
+        'rayfix_station_measurements_total{outcome="outlier",station="a",table="t"} 2.0',
+        'rayfix_station_measurements_total{outcome="unused",station="a",table="t"} 1.0',
+        'rayfix_station_range_residual_meters_count{station="a",table="t"} 0.0',  # of no position that is ok
         'rayfix_fixes_total{status="inconsistent"} 1.0',
         'rayfix_fusion_seconds_bucket{le="0.002"} 0.0',
         'rayfix_fusion_seconds_bucket{le="0.005"} 1.0',

@@ -1,28 +1,28 @@
-"""Locating from an MQTT broker: angles in, positions out. Needs the extra ``rayfix[mqtt]``."""
+"""Reading angles from an MQTT broker and publishing positions there. Needs the extra ``rayfix[mqtt]``."""
 
 import asyncio
 import json
 import logging
 import ssl
 from collections import Counter
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass, field
 from string import Formatter
 from time import monotonic, perf_counter
-from typing import Any
-from urllib.parse import urlsplit
+from typing import Any, Literal
 
 import aiomqtt
 
 from rayfix_service.adapters.adapted import Adapted, with_confidence
-from rayfix_service.adapters.formats import OutputFormat, write
-from rayfix_service.adapters.omlox_hub import HubSettings, OmloxHub, open_hub
-from rayfix_service.adapters.silabs_stream import PAYLOAD_BYTES, SilabsStream
-from rayfix_service.fusion.measurements.report import Frame, Height
+from rayfix_service.adapters.formats import write
+from rayfix_service.adapters.mqtt.settings import Broker, BrokerError, MqttSettings
+from rayfix_service.adapters.omlox_hub import open_hub
+from rayfix_service.adapters.silabs_stream import SilabsStream
 from rayfix_service.locator import Locator
 from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire.names import MAX_NAME, in_log, topic_level
-from rayfix_tables.errors import RayfixError, ReportError
+from rayfix_tables.errors import ReportError
+from rayfix_tables.site import SiteInfo
 
 _log = logging.getLogger(__name__)
 
@@ -30,81 +30,11 @@ _LONGEST_PAUSE = 30.0  # s, between attempts to connect again
 _MOST_TOPIC_BYTES = 65_535  # of MQTT
 _MOST_WAITING = 10_000  # messages; when they come faster than fixes are computed, the newest are dropped
 
+MessageOutcome = Literal["taken", "repeated", "passed_over"]
+"""What became of a message: taken, dropped since it was delivered twice, or of no use."""
 
-class BrokerError(RayfixError):
-    """The MQTT broker cannot be used."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Broker:
-    """Address of the broker, and the credentials for it."""
-
-    host: str
-    port: int = 1883
-    username: str | None = None
-    password: str | None = field(default=None, repr=False)
-    tls: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class MqttSettings:
-    """What is read, how it is joined, and what is published.
-
-    Attributes
-    ----------
-    topic : str
-        Topic filter of locators' angles; topics must end in ``<locator>/<tag>``.
-    publish : str
-        Topic of positions; ``{target_id}`` stands for the tag.
-    output : {"native", "3gpp", "omlox"}
-        Format of positions.
-    window : float, s
-        How long a packet waits for more locators.
-    stations : Mapping
-        Stations by locator, for those that are not stations' identifiers.
-    frame : {"lcs", "scene", "north"}
-        Frame of the angles.
-    height : Height or None
-        What is known of the height of all tags.
-    confidence : float or None
-        Probability with which the accuracies of positions are to hold; None for 0.68.
-    track : bool
-        Whether tags are followed from packet to packet.
-    hub : HubSettings or None
-        Omlox hub that all positions are sent to as well.
-    payload_bytes : int
-        Longest message that is read.
-    """
-
-    topic: str = "silabs/aoa/angle/+/+"
-    publish: str = "rayfix/position/{target_id}"
-    output: OutputFormat = "native"
-    window: float = 0.5
-    stations: Mapping[str, str] = field(default_factory=dict)
-    frame: Frame = "lcs"
-    height: Height | None = None
-    confidence: float | None = None
-    track: bool = False
-    hub: HubSettings | None = None
-    payload_bytes: int = PAYLOAD_BYTES
-
-
-def parse_broker(text: str, *, tls: bool = False, username: str | None = None, password: str | None = None) -> Broker:
-    """Read ``HOST`` or ``HOST:PORT``; the port is 1883, or 8883 with TLS, unless given.
-
-    Raises
-    ------
-    BrokerError
-        For anything else.
-    """
-    try:
-        parts = urlsplit(f"//{text}")
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        host, port = None, None
-    if not host or parts.path or parts.query or parts.fragment or "@" in text:
-        raise BrokerError(f"broker {text!r} is no address; give HOST or HOST:PORT, e.g. localhost:1883")
-    return Broker(host=host, port=port or (8883 if tls else 1883), username=username, password=password, tls=tls)
+Answer = Callable[[Adapted], Awaitable[dict[str, Any]]]
+"""Locates a packet and writes the position that is published; a ReportError says why there is none."""
 
 
 def check_settings(settings: MqttSettings) -> None:
@@ -152,6 +82,18 @@ def topic_for(publish: str, target_id: str) -> str:
     return "".join(parts)
 
 
+def angle_stream(site: SiteInfo, settings: MqttSettings) -> SilabsStream:
+    """Make what joins the angles of a broker into packets, for the stations of a site."""
+    return SilabsStream(
+        site,
+        window=settings.window,
+        stations=settings.stations,
+        frame=settings.frame,
+        height=settings.height,
+        payload_bytes=settings.payload_bytes,
+    )
+
+
 async def run_mqtt(
     locator: Locator, broker: Broker, settings: MqttSettings, *, on_ready: Callable[[], None] | None = None
 ) -> None:
@@ -172,43 +114,25 @@ async def run_mqtt(
     """
     check_settings(settings)
     site = locator.table.site
-    stream = SilabsStream(
-        site,
-        window=settings.window,
-        stations=settings.stations,
-        frame=settings.frame,
-        height=settings.height,
-        payload_bytes=settings.payload_bytes,
-    )
     tracker = Tracker(locator.table) if settings.track else None
     async with open_hub(settings.hub) as hub:
-        session = _Session(locator=locator, settings=settings, stream=stream, tracker=tracker, hub=hub)
-        try:
-            await _run_session(session, broker, on_ready)
-        finally:
-            _log.info("%s", session.summary())
 
+        async def answer(adapted: Adapted) -> dict[str, Any]:
+            begin = perf_counter()
+            report = with_confidence(adapted, settings.confidence).report
+            fused = locator.fuse(report, with_likelihood=tracker is not None)
+            seconds = perf_counter() - begin
+            track = tracker.follow(fused) if tracker is not None else None
+            if hub is not None:
+                hub.tell(fused.fix, site, track)
+            return write(fused.fix, settings.output, site, compute_seconds=seconds, adapted=adapted, track=track)
 
-async def _run_session(session: "_Session", broker: Broker, on_ready: Callable[[], None] | None) -> None:
-    """Connect, and again when the connection breaks."""
-    address, topic = f"{broker.host}:{broker.port}", session.settings.topic
-    connected, pause = False, 1.0
-    while True:
-        try:
-            async with _client(broker) as client:
-                await client.subscribe(topic)
-                connected, pause = True, 1.0
-                _log.info("reading '%s' from %s", topic, address)
-                if on_ready is not None:
-                    on_ready()
-                await _first_of(session.read(client), session.watch(client))
-        except (aiomqtt.MqttError, OSError, ValueError) as error:  # ValueError: of a topic that is none
-            if not connected:
-                text = f"cannot use the MQTT broker {address} ({error}); check its address and your rights"
-                raise BrokerError(text) from error
-            _log.warning("lost the broker %s (%s), trying again in %g s", address, in_log(str(error), most=1000), pause)
-        await asyncio.sleep(pause)
-        pause = min(2.0 * pause, _LONGEST_PAUSE)
+        def connection_changed(connected: bool) -> None:
+            if connected and on_ready is not None:
+                on_ready()
+
+        session = MqttSession(settings=settings, stream=angle_stream(site, settings), answer=answer)
+        await session.run(broker, on_connection=connection_changed)
 
 
 def _client(broker: Broker) -> aiomqtt.Client:
@@ -236,15 +160,71 @@ async def _first_of(*coroutines: Coroutine[Any, Any, None]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Session:
-    """Locates packets: the table, and the state from one packet to the next."""
+class MqttSession:
+    """Reads a broker's angles, and publishes the positions of their packets.
 
-    locator: Locator
+    Attributes
+    ----------
+    settings : MqttSettings
+    stream : SilabsStream
+        Joins the angles; :func:`angle_stream` makes it.
+    answer : callable
+        Locates each packet.
+    on_message : callable
+        Called with what became of each message.
+    site : callable, optional
+        Returns the site whose stations are read now; without it, they stay those of the stream.
+    failed : collections.Counter
+        Packets without a position, and defects.
+    """
+
     settings: MqttSettings
     stream: SilabsStream
-    tracker: Tracker | None
-    hub: OmloxHub | None
+    answer: Answer
+    on_message: Callable[[MessageOutcome], None] = lambda outcome: None
+    site: Callable[[], SiteInfo] | None = None
     failed: Counter[str] = field(default_factory=Counter)
+
+    async def run(self, broker: Broker, *, on_connection: Callable[[bool], None], patient: bool = False) -> None:
+        """Read until cancelled; a broken connection is established again, with pauses of 1 to 30 s.
+
+        Parameters
+        ----------
+        broker : Broker
+        on_connection : callable
+            Called with True each time that the topics are subscribed to, and with False when the broker is lost.
+        patient : bool
+            Whether the first connection may fail, too, and is tried again.
+
+        Raises
+        ------
+        BrokerError
+            When the first connection fails, unless patient.
+        """
+        try:
+            await self._run(broker, on_connection, patient)
+        finally:
+            _log.info("%s", self.summary())
+
+    async def _run(self, broker: Broker, on_connection: Callable[[bool], None], patient: bool) -> None:
+        topic, may_fail, pause = self.settings.topic, patient, 1.0
+        while True:
+            try:
+                async with _client(broker) as client:
+                    await client.subscribe(topic)
+                    may_fail, pause = True, 1.0
+                    _log.info("reading '%s' from %s", topic, broker.address)
+                    on_connection(True)
+                    await _first_of(self.read(client), self.watch(client))
+            except (aiomqtt.MqttError, OSError, ValueError) as error:  # ValueError: of a topic that is none
+                if not may_fail:
+                    text = f"cannot use the MQTT broker {broker.address} ({error}); check its address and your rights"
+                    raise BrokerError(text) from error
+                on_connection(False)
+                reason = in_log(str(error), most=1000)
+                _log.warning("no connection to the broker %s (%s), trying again in %g s", broker.address, reason, pause)
+            await asyncio.sleep(pause)
+            pause = min(2.0 * pause, _LONGEST_PAUSE)
 
     def summary(self) -> str:
         """Count what gave no position, in words."""
@@ -258,14 +238,24 @@ class _Session:
         async for message in client.messages:
             if isinstance(message.payload, bytes):
                 await self._publish(client, self._receive(message.topic.value, message.payload))
+            await asyncio.sleep(0)  # a queue that is never empty would keep all else waiting
 
     def _receive(self, topic: str, payload: bytes) -> list[Adapted]:
+        passed_over, repeated = self.stream.num_passed_over, self.stream.num_repeated
         try:
-            return self.stream.receive(topic, payload, monotonic())
+            if self.site is not None:
+                self.stream.follow(self.site())
+            reports = self.stream.receive(topic, payload, monotonic())
         except Exception:
             self.failed["defect"] += 1
             _log.exception("a message of '%s' failed", in_log(topic))
+            self.on_message("passed_over")
             return []
+        if self.stream.num_passed_over > passed_over:
+            self.on_message("passed_over")
+        else:
+            self.on_message("repeated" if self.stream.num_repeated > repeated else "taken")
+        return reports
 
     async def watch(self, client: aiomqtt.Client) -> None:
         """Complete packets that not all locators have received."""
@@ -277,7 +267,7 @@ class _Session:
         for adapted in reports:
             target = in_log(adapted.report.target_id or "")
             try:
-                document = json.dumps(self._answer(adapted))
+                document = json.dumps(await self.answer(adapted))
             except ReportError as error:
                 self.failed["no position"] += 1
                 _log.info("no position of '%s': %s", target, in_log(str(error), most=1000))
@@ -292,14 +282,3 @@ class _Session:
             except ValueError as error:  # of paho: a topic or a message that MQTT does not carry
                 self.failed["defect"] += 1
                 _log.error("a position of '%s' cannot be published: %s", target, error)
-
-    def _answer(self, adapted: Adapted) -> dict[str, Any]:
-        """Locate a packet, update its tag's track, and send the position to the hub."""
-        begin = perf_counter()
-        fused = self.locator.fuse(with_confidence(adapted, self.settings.confidence).report)
-        seconds = perf_counter() - begin
-        track = self.tracker.follow(fused) if self.tracker is not None else None
-        site = self.locator.table.site
-        if self.hub is not None:
-            self.hub.tell(fused.fix, site, track)
-        return write(fused.fix, self.settings.output, site, compute_seconds=seconds, adapted=adapted, track=track)

@@ -1,0 +1,1 @@
+"""Locating from an MQTT broker: its settings, and the session that reads it."""
