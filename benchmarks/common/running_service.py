@@ -21,6 +21,8 @@ class RunningService:
     command : list of str
         Arguments of the Python interpreter.
 
+    The waits are long enough for the kernels to be compiled.
+
     Attributes
     ----------
     process : subprocess.Popen
@@ -42,7 +44,7 @@ class RunningService:
         self._log.seek(0)
         return self._log.read()
 
-    def wait_until_listening(self, seconds: float = 120.0) -> None:
+    def wait_until_listening(self, seconds: float = 600.0) -> None:
         """Wait until it has printed its address.
 
         Raises
@@ -57,7 +59,7 @@ class RunningService:
             time.sleep(0.02)
         self.url = found[1]
 
-    def wait_until_ready(self, seconds: float = 120.0) -> None:
+    def wait_until_ready(self, seconds: float = 600.0) -> None:
         """Wait until it can locate.
 
         Raises

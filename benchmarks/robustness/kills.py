@@ -90,7 +90,11 @@ class Attack:
     def _start(self) -> RunningService:
         os.environ["TMPDIR"] = str(self._temporary)
         service = RunningService(serve_command(self._tables, "--workers", str(WORKERS)))
-        service.wait_until_ready()
+        try:
+            service.wait_until_ready()
+        except RuntimeError:
+            service.close()
+            raise
         self.load.port = service.port
         return service
 

@@ -25,7 +25,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from rayfix_service.fusion.locator import Locator
 
 from benchmarks.common.costly_reports import random_measurement, random_report
 from benchmarks.common.example_table import open_or_build, table_parser
@@ -34,6 +33,7 @@ from benchmarks.common.running_service import open_files, resident_mebibytes, ru
 from benchmarks.common.sound_answers import faults_of
 from rayfix_service.fusion.measurements.report import Angle, Height, Report
 from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.locator import Locator
 from rayfix_service.wire import InvalidReportError, report_to_document
 from rayfix_tables.errors import ReportError
 
