@@ -83,7 +83,7 @@ def build_variants(
 
 
 def _variant(site: SiteFile, site_path: Path, name: str, coarse: bool) -> dict[str, Any]:
-    document = site.model_dump(mode="json")
+    document = site.model_dump(mode="json", exclude_none=True)
     document["site"]["scene"] = str((site_path.parent / site.site.scene).resolve())
     finest, *wider = site.table.windows_deg
     if coarse:
