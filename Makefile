@@ -135,10 +135,10 @@ $(TOOLS)/.done: Makefile
 	timeout 60 $(TOOLS)/bin/python -m pip install --quiet cyclonedx-bom==7.5.0 pip-audit==2.10.1
 	touch $@
 
-# Known vulnerabilities of what the images install; left out, with the reason, where the database cannot be reached.
+# Known vulnerabilities of what the images install fail; a line says what could not be audited, and why.
 audit:
 	-@$(MAKE) --no-print-directory $(TOOLS)/.done
-	@tools/audit.sh $(TOOLS)/bin/python
+	@$(PYTHON) tools/audit.py $(TOOLS)/bin/python
 
 # Bills of materials (CycloneDX) of the wheel and the images, beside the wheel in dist/.
 bom: $(TOOLS)/.done

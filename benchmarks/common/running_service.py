@@ -6,11 +6,15 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
+
+
+def _nothing() -> None:
+    """Do nothing while a service starts."""
 
 
 class RunningService:
@@ -20,6 +24,8 @@ class RunningService:
     ----------
     command : list of str
         Arguments of the Python interpreter.
+
+    The waits are long enough for the kernels to be compiled.
 
     Attributes
     ----------
@@ -42,8 +48,8 @@ class RunningService:
         self._log.seek(0)
         return self._log.read()
 
-    def wait_until_listening(self, seconds: float = 120.0) -> None:
-        """Wait until it has printed its address.
+    def wait_until_listening(self, seconds: float = 600.0, *, meanwhile: Callable[[], None] = _nothing) -> None:
+        """Wait until it has printed its address, and call ``meanwhile`` often.
 
         Raises
         ------
@@ -54,22 +60,24 @@ class RunningService:
         while not (found := re.search(r"running on (http://127\.0\.0\.1:\d+)", self.log())):
             if self.process.poll() is not None or time.monotonic() > deadline:
                 raise RuntimeError(f"the service does not listen:\n{self.log()}")
+            meanwhile()
             time.sleep(0.02)
         self.url = found[1]
 
-    def wait_until_ready(self, seconds: float = 120.0) -> None:
-        """Wait until it can locate.
+    def wait_until_ready(self, seconds: float = 600.0, *, meanwhile: Callable[[], None] = _nothing) -> None:
+        """Wait until it can locate, and call ``meanwhile`` often.
 
         Raises
         ------
         RuntimeError
             When it ends or takes too long.
         """
-        self.wait_until_listening(seconds)
+        self.wait_until_listening(seconds, meanwhile=meanwhile)
         deadline = time.monotonic() + seconds
         while not answers(f"{self.url}/readyz"):
             if self.process.poll() is not None or time.monotonic() > deadline:
                 raise RuntimeError(f"the service does not become ready:\n{self.log()}")
+            meanwhile()
             time.sleep(0.02)
 
     def close(self) -> None:

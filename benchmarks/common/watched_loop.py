@@ -2,17 +2,23 @@
 
 As a program it takes a table and a file of at least 32 bytes, and serves the table with one worker. The loop is
 asyncio's own: that of uvloop, which the service has otherwise, calls the same callbacks and has no place to measure
-them.
+them. With a third argument, a file, it writes there the stacks of all threads whenever the interpreter's lock was held
+for :data:`HELD_SECONDS`, or the machine let nothing of this process run.
 """
 
 import asyncio.events
+import faulthandler
 import mmap
 import sys
+import threading
+import time
 from pathlib import Path
 from time import perf_counter, thread_time
 from typing import Any
 
 from rayfix_service.server.server import serve
+
+HELD_SECONDS = 0.05
 
 _NUMBERS = 4
 
@@ -60,7 +66,21 @@ def watch(times: LoopTimes) -> None:
     asyncio.events.Handle._run = measured  # type: ignore[method-assign]
 
 
+def watch_interpreter(path: Path) -> None:
+    """Write the stacks of all threads whenever none could run Python code for some time."""
+
+    def keep() -> None:
+        with path.open("w") as file:
+            while True:  # it is a thread without Python that writes, unless this one is in time
+                faulthandler.dump_traceback_later(HELD_SECONDS, file=file)
+                time.sleep(0.005)
+
+    threading.Thread(target=keep, daemon=True).start()
+
+
 if __name__ == "__main__":
     sys.modules["uvloop"] = None  # type: ignore[assignment]
     watch(LoopTimes(Path(sys.argv[2])))
+    if sys.argv[3:]:
+        watch_interpreter(Path(sys.argv[3]))
     serve(sys.argv[1], port=0)

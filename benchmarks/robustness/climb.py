@@ -14,10 +14,8 @@ wakes is printed beside it. By the clock, the loop's longest callback is printed
 
 import http.client
 import json
-import math
 import sys
 import tempfile
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -26,15 +24,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rayfix_service.fusion.locator import Locator
 
 from benchmarks.common.costly_reports import changed_report, random_report
 from benchmarks.common.example_table import open_or_build, table_parser
+from benchmarks.common.livez import Livez, Waits
 from benchmarks.common.malformed import changed_message, random_message
-from benchmarks.common.running_service import RunningService
+from benchmarks.common.running_service import running, serve_command
 from benchmarks.common.watched_loop import LoopTimes
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.http.settings import BodyLimits, ServiceSettings
+from rayfix_service.locator import Locator
 from rayfix_service.wire import InvalidReportError, report_to_document
 
 RESTART = 30
@@ -154,45 +153,6 @@ class MessageSearch:
 Search = ReportSearch | BatchSearch | MessageSearch
 
 
-class Livez(threading.Thread):
-    """Asks for ``/livez`` over and over; between that it sleeps, and notes how late it wakes."""
-
-    def __init__(self, port: int) -> None:
-        super().__init__(daemon=True)
-        self._port = port
-        self._end = threading.Event()
-        self.waits: list[float] = []
-        self.late: list[float] = []
-        self._longest = 0.0
-
-    def take(self) -> float:
-        """Return the longest wait since the last call, s."""
-        longest, self._longest = self._longest, 0.0
-        return longest
-
-    def run(self) -> None:
-        """Ask until told to end."""
-        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=60)
-        while not self._end.is_set():
-            begin = time.perf_counter()
-            time.sleep(0.02)
-            slept = time.perf_counter()
-            self.late.append(slept - begin - 0.02)
-            try:
-                connection.request("GET", "/livez")
-                ok = connection.getresponse().read() is not None
-            except (OSError, http.client.HTTPException):
-                connection.close()
-                ok = False
-            self.waits.append(time.perf_counter() - slept if ok else math.inf)
-            self._longest = max(self._longest, self.waits[-1])
-
-    def close(self) -> None:
-        """End it."""
-        self._end.set()
-        self.join()
-
-
 def post(port: int, message: Message, times: LoopTimes) -> Answered:
     """Post a message and see what the loop did meanwhile."""
     kind = "text/plain" if message.path.endswith("ublox") else "application/json"
@@ -235,9 +195,10 @@ def main() -> None:
     parser.add_argument("--slack", type=float, default=2.0, help="s after the time limit of a fix; default 2")
     parser.add_argument("--livez", type=float, default=0.1, help="s; default 0.1")
     parser.add_argument("--late-share", type=float, default=0.001, help="default 0.001")
+    parser.add_argument("--stacks", metavar="FILE")
     options = parser.parse_args()
     with open_or_build(options.table) as table, tempfile.TemporaryDirectory() as folder:
-        found, livez = attack(Locator(table), Path(folder), options)
+        found, waits = attack(Locator(table), Path(folder), options)
     for status, count in sorted(found.statuses.items()):
         print(f"{status or 'no answer':>9} {count:8}")
     print("callbacks of the loop, processor time:")
@@ -249,16 +210,10 @@ def main() -> None:
     print("time for an answer by the clock:")
     for seconds, what in found.seconds[:5]:
         print(f"  {seconds:7.1f} s   {what}")
-    waits, late = np.array(livez.waits), np.array(livez.late)
-    share = float((waits > options.livez).mean())
-    print(
-        f"longest callback by the clock {1e3 * found.wall:.0f} ms\n"
-        f"/livez {len(waits)} times: median {1e3 * np.median(waits):.1f} ms, "
-        f"99.9 % {1e3 * np.quantile(waits, 0.999):.0f} ms, "
-        f"at most {1e3 * waits.max():.0f} ms, {share:.4%} above {1e3 * options.livez:.0f} ms\n"
-        f"a thread that sleeps wakes late by at most {1e3 * late.max():.0f} ms, "
-        f"99.9 % {1e3 * np.quantile(late, 0.999):.0f} ms"
-    )
+    print(f"longest callback by the clock {1e3 * found.wall:.0f} ms\n/livez:")
+    print("\n".join(waits.lines(options.livez)))
+    share = waits.own_share(options.livez)
+    print(f"  the service's own share above {1e3 * options.livez:.0f} ms is {share:.4%}")
     held = max((seconds for seconds, _ in found.processor), default=0.0)
     if held > options.held:
         found.faults.append(f"the loop was held for {1e3 * held:.1f} ms")
@@ -268,15 +223,19 @@ def main() -> None:
         sys.exit("a bound does not hold: " + "; ".join(found.faults[:10]))
 
 
-def attack(locator: Locator, folder: Path, options: Any) -> tuple[Found, Livez]:
+def attack(locator: Locator, folder: Path, options: Any) -> tuple[Found, Waits]:
     """Search for as long as is wanted."""
     stations = [station.id for station in locator.table.site.stations]
-    times = LoopTimes(folder / "times")
-    service = RunningService(["-m", "benchmarks.common.watched_loop", str(locator.table.path), str(folder / "times")])
-    try:
-        service.wait_until_ready()
-        found, livez = Found(), Livez(service.port)
-        livez.start()
+    table, times = locator.table.path, LoopTimes(folder / "times")
+    command = [
+        "-m",
+        "benchmarks.common.watched_loop",
+        str(table),
+        str(folder / "times"),
+        *filter(None, [options.stacks]),
+    ]
+    with running(command) as service, running(serve_command(table)) as idle:
+        found, livez = Found(), Livez(folder / "longest", service.port, idle.port)
 
         def send(message: Message) -> Answered:
             answer = post(service.port, message, times)
@@ -296,11 +255,11 @@ def attack(locator: Locator, folder: Path, options: Any) -> tuple[Found, Livez]:
         rng = np.random.default_rng(options.seed)
         reports = ReportSearch(stations, rng)
         until = time.monotonic() + 60.0 * options.minutes
-        climb(send, [reports, MessageSearch(rng), BatchSearch(reports, locator, rng), MessageSearch(rng)], until)
-        livez.close()
-    finally:
-        service.close()
-    return found, livez
+        try:
+            climb(send, [reports, MessageSearch(rng), BatchSearch(reports, locator, rng), MessageSearch(rng)], until)
+        finally:
+            waits = livez.close()
+    return found, waits
 
 
 if __name__ == "__main__":

@@ -8,7 +8,8 @@ answer is 5xx but 504 for a fix that reached its time limit; the memory after al
 after the first half, and no file descriptor is left open. Of the valid reports, `--slow-share` are of all kinds,
 nine of ten of which are slow by their estimate and are located in threads; the others are drawn until the estimate
 calls them quick. The service runs with MALLOC_MMAP_THRESHOLD_=131072, so that what the C library keeps of freed memory
-is not taken for a leak. Request n depends on the seed and n alone: `--only n` sends that one and prints the answer.
+is not taken for a leak, unless `--usual-memory` is given. Request n depends on the seed and n alone: `--only n` sends
+that one and prints the answer.
 """
 
 import http.client
@@ -25,7 +26,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from rayfix_service.fusion.locator import Locator
 
 from benchmarks.common.costly_reports import random_measurement, random_report
 from benchmarks.common.example_table import open_or_build, table_parser
@@ -34,6 +34,7 @@ from benchmarks.common.running_service import open_files, resident_mebibytes, ru
 from benchmarks.common.sound_answers import faults_of
 from rayfix_service.fusion.measurements.report import Angle, Height, Report
 from rayfix_service.http.settings import ServiceSettings
+from rayfix_service.locator import Locator
 from rayfix_service.wire import InvalidReportError, report_to_document
 from rayfix_tables.errors import ReportError
 
@@ -159,9 +160,13 @@ def main() -> None:
     parser.add_argument("--slow-share", type=float, default=0.1, help="of the valid ones; default 0.1")
     parser.add_argument("--seconds", type=float, default=3600.0, help="when to end earlier")
     parser.add_argument("--growth", type=float, default=4.0, help="MiB from the first half's end on; default 4")
+    parser.add_argument(
+        "--usual-memory", action="store_true", help="let the C library keep freed memory as it does for users"
+    )
     parser.add_argument("--only", type=int, metavar="N", help="send one request")
     options = parser.parse_args()
-    os.environ["MALLOC_MMAP_THRESHOLD_"] = str(128 << 10)
+    if not options.usual_memory:
+        os.environ["MALLOC_MMAP_THRESHOLD_"] = str(128 << 10)
     total = options.valid + options.malformed
     with open_or_build(options.table) as table, running(serve_command(table.path)) as service:
         locator = Locator(table)

@@ -23,6 +23,8 @@ from rayfix_service.fusion.measurements.report import (
     TimeDifference,
     TimeOfArrival,
 )
+from rayfix_service.fusion.posterior.fix import Fix
+from rayfix_service.fusion.posterior.fused import Fused
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import FixStoppedError, Stop
@@ -360,3 +362,35 @@ def test_pictures_of_the_table_are_bounded_too(hall_table_path: Path) -> None:
     with RunningApp(hall_table_path, reports_per_second=0.01, burst_seconds=200.0) as service:
         paths = [mixture.format(1), "/v1/stations/bs1/coverage", mixture.format(1), "/v1/stations/bs1/coverage"]
         assert [service.get(path).status_code for path in paths] == [200, 200, 429, 429]
+
+
+def test_the_search_for_a_cause_has_what_the_fix_has_left_of_its_time(
+    hall_table_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each had a whole limit, and an answer took up to two."""
+    fuse, searched = Locator.fuse, []
+
+    def slow_fuse(self: Locator, report: Report, *, stop: Stop) -> Fused:
+        time.sleep(2.4)
+        fused = fuse(self, report, stop=stop)
+        return replace(fused, fix=replace(fused.fix, status="inconsistent"))
+
+    def search(self: Locator, report: Report, fix: Fix, *, stop: Stop) -> Fix:
+        begin = time.monotonic()
+        try:
+            while time.monotonic() < begin + 30.0:
+                stop.check()
+                time.sleep(0.01)
+        finally:
+            searched.append(time.monotonic() - begin)
+        return fix
+
+    measurement = {"type": "pt", "station_id": "bs1", "range_m": 7.0, "stdev_m": 1.0}
+    with RunningApp(hall_table_path, fix_seconds=4.0, quick_fix_seconds=0.0) as service:
+        monkeypatch.setattr(Locator, "fuse", slow_fuse)
+        monkeypatch.setattr(Locator, "explain", search)
+        answer = service.post("/v1/positions", {"measurements": [measurement]})
+        assert answer.json()["status"] == "inconsistent"
+        service.wait_for(lambda: _idle(service), seconds=10.0)
+    assert len(searched) == 1
+    assert searched[0] < 3.0

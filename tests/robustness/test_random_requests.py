@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-from rayfix_service.fusion.locator import Locator
-
 from benchmarks.robustness.reports import Found, Source, judge
+from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
 from tests.support.running_app import RunningApp
 

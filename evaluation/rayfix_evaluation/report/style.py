@@ -1,5 +1,6 @@
 """How figures look, and how they are written."""
 
+import io
 import re
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -10,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from rayfix_tables.errors import RayfixError
+from rayfix_evaluation.studies.store import write_bytes, write_text
 
 __all__ = ["METHOD_COLOURS", "SERIES", "STATIONS", "inline_svg", "new_figure", "percent_axis", "write_figure"]
 
@@ -100,15 +101,12 @@ def write_figure(figure: Figure, stem: Path) -> None:
     RayfixError
         When they cannot be written.
     """
-    try:
-        stem.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(stem.with_suffix(".svg"), metadata={"Date": None}, dpi=110)
-        drawn = stem.with_suffix(".svg").read_text(encoding="utf-8")
-        # A hundredth of a point is enough, and half of the file.
-        stem.with_suffix(".svg").write_text(re.sub(r"(\d\.\d\d)\d+", r"\1", drawn), encoding="utf-8")
-        figure.savefig(stem.with_suffix(".png"), dpi=140)
-    except OSError as error:
-        raise RayfixError(f"cannot write {stem}.svg: {error.strerror}; choose another folder with -o") from error
+    drawn, picture = io.StringIO(), io.BytesIO()
+    figure.savefig(drawn, format="svg", metadata={"Date": None}, dpi=110)
+    # A hundredth of a point is enough, and half of the file.
+    write_text(stem.with_suffix(".svg"), re.sub(r"(\d\.\d\d)\d+", r"\1", drawn.getvalue()))
+    figure.savefig(picture, format="png", dpi=140)
+    write_bytes(stem.with_suffix(".png"), picture.getvalue())
 
 
 def inline_svg(path: Path) -> str:

@@ -21,7 +21,7 @@ from rayfix_evaluation.studies.pictures import draw_pictures
 from rayfix_evaluation.studies.planning import plan_site
 from rayfix_evaluation.studies.pool import Task, run_tasks
 from rayfix_evaluation.studies.statements import check_statements
-from rayfix_evaluation.studies.store import Store, code_digest
+from rayfix_evaluation.studies.store import Store, code_digest, not_written
 from rayfix_evaluation.studies.summary import Run, percentile, summarise
 from rayfix_evaluation.studies.variants import SITE, build_variants, open_site_table
 from rayfix_tables.checked import open_checked
@@ -94,7 +94,7 @@ def evaluate_site(
     try:
         (work / "tables").mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RayfixError(f"cannot write {work}: {error.strerror}; choose another folder with -o") from error
+        raise not_written(work, error) from error
     site_table = open_site_table(site_path, table_path, work / "tables", jobs=jobs, progress=progress)
     opened = open_checked(site_table, whole=False)
     table = opened.in_table_frame  # fits of the methods beside rayfix would lose digits on map coordinates

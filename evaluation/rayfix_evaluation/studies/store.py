@@ -1,10 +1,11 @@
 """Results on disk: whatever is finished is kept, and a run that finds it does not do it again."""
 
 import ast
+import errno
 import hashlib
 import json
-import os
 import re
+import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -18,7 +19,7 @@ import rayfix_tables
 from rayfix_evaluation.studies.cases import document_key
 from rayfix_tables.errors import RayfixError
 
-__all__ = ["Store", "code_digest", "write_json"]
+__all__ = ["Store", "code_digest", "not_written", "write_bytes", "write_json", "write_text"]
 
 _NOT_NUMERIC = ("report", "pictures", "http", "server", "web", "adapters", "__pycache__")
 """Folders whose code does not change a number."""
@@ -67,7 +68,12 @@ def write_json(path: Path, document: Any, *, indent: int | None = 1) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text beside its place and rename it.
+    """Write a text as :func:`write_bytes` does, in UTF-8."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file beside its place and rename it, so that under its name it is whole or as it was.
 
     Raises
     ------
@@ -76,11 +82,24 @@ def write_text(path: Path, text: str) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{path.name}.{os.getpid()}")
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
+        # Not by the process's number, which two containers on one volume may have in common.
+        part = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+        try:
+            part.write_bytes(content)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
     except OSError as error:
-        raise RayfixError(f"cannot write {path}: {error.strerror}; choose another folder with -o") from error
+        raise not_written(path, error) from error
+
+
+def not_written(path: Path, error: OSError) -> RayfixError:
+    """Return the error of a file of the report's folder that cannot be written, with the remedy."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        remedy = "nothing finished is lost: free some space and start again"
+    else:
+        remedy = "choose another folder with -o"
+    return RayfixError(f"cannot write {path}: {error.strerror}; {remedy}")
 
 
 @cache

@@ -17,6 +17,11 @@ _SCAN_SECONDS = 1.0
 _GREETING = b"\n"
 _LONGEST_LINE = 32 << 20  # bytes; a report within its limit, and its fix
 
+_NO_SOCKET = (
+    "fixes of process %d do not reach the listeners of other workers, as the socket %s cannot be made: %s; set TMPDIR "
+    "to a folder with a short path and room, and start the service again"
+)
+
 _log = logging.getLogger(__name__)
 
 
@@ -40,8 +45,15 @@ class FeedRelay:
         self._clients: set[asyncio.Task[None]] = set()
 
     async def keep(self) -> None:
-        """Serve the other workers, and stay connected to them while there are listeners here; until it is cancelled."""
-        server = await asyncio.start_unix_server(self._tell, self._own, limit=_LONGEST_LINE)
+        """Serve the other workers, and stay connected to them while there are listeners here; until it is cancelled.
+
+        Without a place for its socket, the worker goes on and its fixes reach its own listeners alone.
+        """
+        try:
+            server = await asyncio.start_unix_server(self._tell, self._own, limit=_LONGEST_LINE)
+        except OSError as error:
+            _log.error(_NO_SOCKET, os.getpid(), self._own, error)
+            return
         try:
             while True:
                 await asyncio.sleep(_SCAN_SECONDS)

@@ -179,10 +179,13 @@ class Answerer:
             raise error_in_message(error, incoming.adapted) from None
         if track is not None:
             self.metrics.track_done(track.state)
-        return Located(await self._explained(locator, report, fused.fix), track, seconds)
+        return Located(await self._explained(locator, report, fused.fix, perf_counter() - start), track, seconds)
 
-    async def _explained(self, locator: Locator, report: Report, fix: Fix) -> Fix:
-        """Look in a thread for what may be wrong with the site, where a fix is inconsistent and no other work waits."""
+    async def _explained(self, locator: Locator, report: Report, fix: Fix, spent: float) -> Fix:
+        """Look in a thread for what may be wrong with the site, where a fix is inconsistent and no other work waits.
+
+        It takes what the fix has left of the time limit, at most.
+        """
         if fix.status != "inconsistent" or self.slow_work.under_way:
             return fix
 
@@ -190,7 +193,7 @@ class Answerer:
             return locator.explain(report, fix, stop=stop)
 
         try:
-            return await self.slow_work.locate(explain, report)
+            return await self.slow_work.locate(explain, report, spent=spent)
         except ProblemError:  # too busy, or too long: the fix itself is there
             return fix
 

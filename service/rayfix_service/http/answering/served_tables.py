@@ -5,6 +5,7 @@ import logging
 import threading
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -328,8 +329,13 @@ class Tables:
         """Check all files, and ask the other workers to."""
         changes = await self.refresh(again=True)
         if self._marker is not None:
-            self._marker.write_bytes(b"")
-            self._marked = file_state(self._marker)
+            try:
+                self._marker.write_bytes(b"")
+                self._marked = file_state(self._marker)
+            except OSError as error:
+                _log.error(
+                    "the other workers are not asked to look at the tables' files: %s; they will by themselves", error
+                )
         return changes
 
     async def _watch_once(self, before: dict[str, FileState]) -> dict[str, FileState]:
@@ -382,7 +388,8 @@ class Tables:
         self.became_ready.set()
         self._metrics.became_ready()
         if self._runtime_folder is not None:
-            (self._runtime_folder / "ready").touch()
+            with suppress(OSError):  # full or gone: a worker to come then takes connections before it can locate
+                (self._runtime_folder / "ready").touch()
         _log.info("ready with %s", ", ".join(_described(table) for table in self._served.values()))
 
     async def _look(self, name: str, path: Path, *, again: bool) -> TableChange:

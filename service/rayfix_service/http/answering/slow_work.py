@@ -60,8 +60,16 @@ class SlowWork:
 
         return await self.locate(do, None)
 
-    async def locate(self, locate: Stoppable[Asked_contra, T], report: Asked_contra) -> T:
+    async def locate(self, locate: Stoppable[Asked_contra, T], report: Asked_contra, *, spent: float = 0.0) -> T:
         """Locate a report in a thread, or do other work of similar length.
+
+        Parameters
+        ----------
+        locate : callable
+        report : object
+            What is given to it.
+        spent : float
+            Time that the same request has had already, s; the limit is for all of it.
 
         Raises
         ------
@@ -84,7 +92,7 @@ class SlowWork:
         work.add_done_callback(self._done)
         try:
             # A thread cannot be ended: what is given up counts as under way until it has stopped.
-            return await asyncio.wait_for(asyncio.shield(work), self._seconds)
+            return await asyncio.wait_for(asyncio.shield(work), max(self._seconds - spent, 0.0))
         except (TimeoutError, FixStoppedError):
             raise ProblemError(
                 FIX_TIMEOUT, f"the fix took longer than {self._seconds:g} s; send fewer measurements"

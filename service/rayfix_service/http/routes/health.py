@@ -67,7 +67,12 @@ async def readyz(services: ServicesDep) -> Ready:
     )
 
 
-@router.get("/metrics", summary="Figures for Prometheus", response_class=PlainTextResponse)
+@router.get(
+    "/metrics",
+    summary="Figures for Prometheus",
+    response_class=PlainTextResponse,
+    responses=problem_responses(NOT_READY),
+)
 async def metrics(request: Request, services: ServicesDep) -> Response:
     """Tell how many requests and fixes there were, how long they took, and which table answers."""
     text, media_type = services.metrics.exposition(request.headers.get("accept", ""))

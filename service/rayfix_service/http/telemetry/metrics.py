@@ -12,7 +12,9 @@ from prometheus_client.multiprocess import MultiProcessCollector
 from rayfix_service.adapters.omlox_hub import HubOutcome
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix, Status
+from rayfix_service.http.problems import NOT_READY, ProblemError
 from rayfix_service.http.telemetry.connections import CLOSED, Closed
+from rayfix_service.http.telemetry.figure_files import ReservedDict
 from rayfix_service.http.telemetry.report_figures import SECONDS, ReportFigures
 from rayfix_service.http.telemetry.station_figures import OUTCOMES, StationFigures, outcome_name
 from rayfix_service.tracking.track import TrackState
@@ -212,11 +214,21 @@ class Metrics:
         ----------
         accept : str
             The request's Accept header.
+
+        Raises
+        ------
+        ProblemError
+            When the folder of the workers' figures is gone.
         """
         registry = self._registry
         if MULTIPROCESS_VARIABLE in os.environ:
             registry = CollectorRegistry()
-            MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
+            try:
+                MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
+            except ValueError:
+                raise ProblemError(
+                    NOT_READY, "the folder of the workers' figures has been removed; start the service again"
+                ) from None
         encode, media_type = choose_encoder(",".join(filter(_ACCEPTABLE.fullmatch, accept.split(","))))
         return encode(registry), media_type
 
@@ -228,8 +240,10 @@ def _table_labels(name: str, table: Table) -> tuple[str, ...]:
 def share_figures() -> None:
     """Keep figures that are created from now on in files of this process, in the folder of ``MULTIPROCESS_VARIABLE``.
 
-    prometheus-client reads the variable when it is imported, which is before there are workers.
+    prometheus-client reads the variable when it is imported, which is before there are workers. Where the folder has no
+    room or is gone, the figures of this process are in its memory, and a warning says so.
     """
+    values.MmapedDict = ReservedDict  # type: ignore[misc]
     values.ValueClass = values.get_value_class()  # type: ignore[no-untyped-call]
 
 

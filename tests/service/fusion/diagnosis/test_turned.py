@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rayfix_service.fusion.locator import Locator
 
 from rayfix_service.fusion.diagnosis.common_turn import common_turns
 from rayfix_service.fusion.diagnosis.turned import find_turns, turned_report
@@ -14,6 +13,7 @@ from rayfix_service.fusion.measurements.directions import to_scene
 from rayfix_service.fusion.measurements.report import Angle, Frame, Measurement, Range, Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.locator import Locator
 from rayfix_tables.angles import angles_of, local_to_scene
 from rayfix_tables.site import Station
 from rayfix_tables.table import Table
