@@ -6,7 +6,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
-from rayfix_tables.mounting import FRAMES
+from rayfix_tables.geometry.mounting import FRAMES
 from rayfix_tables.site import Mounting
 
 mpl.use("Agg")

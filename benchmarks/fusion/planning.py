@@ -13,7 +13,7 @@ from rayfix_evaluation.drops.simulate import Noise, Timing
 from rayfix_evaluation.planning.forecast import PlanMap, PlanSettings, draw_places, forecast
 from rayfix_evaluation.planning.station_mixture import audible_paths
 from rayfix_service.locator import Locator
-from rayfix_tables.angles import direction
+from rayfix_tables.geometry.angles import direction
 from rayfix_tables.table import Table
 
 CASES: list[tuple[float, Timing]] = [

@@ -25,7 +25,7 @@ from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.rays.trace import LevelRays, trace_station
 from rayfix_offline.site import SiteFile, parse_site
 from rayfix_offline.twin.twin import Twin, prepare_twin
-from rayfix_tables.angles import wrap
+from rayfix_tables.geometry.angles import wrap
 
 STATION = (0.3, 0.4, 2.6)
 PILLAR = (4.0, 5.0)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rayfix_evaluation.truth.forward import Paths
 from rayfix_service.measuring.ranging import SPEED_OF_LIGHT
-from rayfix_tables.angles import direction
+from rayfix_tables.geometry.angles import direction
 
 Array = NDArray[np.float64]
 

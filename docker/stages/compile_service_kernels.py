@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.http.answering.served_tables import load_table
-from rayfix_tables.angles import direction
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.geometry.angles import direction
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture, pack

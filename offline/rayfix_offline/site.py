@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from rayfix_tables.errors import SiteError
-from rayfix_tables.mounting import Boresight, boresight_of, orientation_of
-from rayfix_tables.problems import path_text
+from rayfix_tables.geometry.mounting import Boresight, boresight_of, orientation_of
 from rayfix_tables.site import Mounting, SiteInfo, Station, StationBias
+from rayfix_tables.validation.problems import path_text
 
 MIN_WINDOW_RATIO = 1.5
 """Smallest ratio of a window to the one before: its cells are sums of finer cells, which must add up to its window."""

@@ -6,7 +6,7 @@ from email.utils import parsedate_to_datetime
 from random import Random
 from typing import Annotated
 
-from rayfix_tables.limits import Limits, check_limits
+from rayfix_tables.validation.limits import Limits, check_limits
 
 _AGAIN = frozenset({429, 502, 503, 504})
 """Statuses of a service that is busy, starting, or behind a proxy that cannot reach it."""

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rayfix_tables.angles import wrap
+from rayfix_tables.geometry.angles import wrap
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Mounting = Literal["3gpp", "silabs", "ublox"]
-"""Local frame of an array, by who defines it; :mod:`rayfix_tables.mounting` has their axes."""
+"""Local frame of an array, by who defines it; :mod:`rayfix_tables.geometry.mounting` has their axes."""
 
 
 @dataclass(frozen=True, kw_only=True)

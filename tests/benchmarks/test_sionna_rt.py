@@ -6,7 +6,7 @@ import trimesh
 
 from benchmarks.truth.sionna_rt import NOTHING_COMPARED, FoundPaths, compare, shortest_segment, sionna_paths
 from rayfix_evaluation.truth.forward import ForwardSolver
-from rayfix_tables.angles import direction
+from rayfix_tables.geometry.angles import direction
 
 STATIONS = np.array([[0.5, 0.6, 2.6], [3.6, 4.4, 2.3]])
 POINTS = np.array([[1.6, 3.4, 1.1], [3.0, 1.2, 0.4]])

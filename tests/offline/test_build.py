@@ -18,8 +18,8 @@ from rayfix_offline.fit import cells
 from rayfix_offline.fit.settings import TubeFit
 from rayfix_offline.fit.tubes import Fitted, fit_tubes
 from rayfix_offline.rays.trace import LevelRays, level_grid
-from rayfix_tables.angles import direction, local_to_scene
 from rayfix_tables.errors import SceneError, SiteError, TableError
+from rayfix_tables.geometry.angles import direction, local_to_scene
 from rayfix_tables.table import Table
 
 WriteSite = Callable[..., Path]

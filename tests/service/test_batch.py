@@ -10,8 +10,8 @@ from rayfix_service.batch import locate_batch
 from rayfix_service.fusion.measurements.report import Angle, Range, Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.locator import Locator
-from rayfix_tables.angles import angles_of
 from rayfix_tables.errors import ReportError, TableError
+from rayfix_tables.geometry.angles import angles_of
 from rayfix_tables.table import Table
 
 

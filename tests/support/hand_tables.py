@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.angles import angles_of, direction
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.geometry.angles import angles_of, direction
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture, pack

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rayfix_tables.angles import angles_of, wrap
+from rayfix_tables.geometry.angles import angles_of, wrap
 from rayfix_tables.grid import AngularGrid
 
 spacings = st.floats(0.02, 1.5)  # rad

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from rayfix_evaluation.truth.forward import Paths
 from rayfix_service.measuring.ranging import SPEED_OF_LIGHT
-from rayfix_tables.angles import direction
-from rayfix_tables.mounting import board_to_scene
+from rayfix_tables.geometry.angles import direction
+from rayfix_tables.geometry.mounting import board_to_scene
 from rayfix_tables.site import Station
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ from rayfix_evaluation.arrays.planar import (
 from rayfix_evaluation.arrays.statistics import AngleErrors, AngleStatistics, angle_statistics
 from rayfix_evaluation.drops.accuracy import Drop
 from rayfix_evaluation.truth.forward import Paths
-from rayfix_tables.angles import angles_of, direction, wrap
+from rayfix_tables.geometry.angles import angles_of, direction, wrap
 from rayfix_tables.site import Station
 
 

@@ -15,7 +15,7 @@ from rayfix_evaluation.baselines.reports import sort_for_rivals
 from rayfix_evaluation.drops.accuracy import clear_of_solids, solver_of
 from rayfix_evaluation.paper.reports import PaperReport
 from rayfix_service.fusion.measurements.report import Report
-from rayfix_tables.angles import direction
+from rayfix_tables.geometry.angles import direction
 from rayfix_tables.site import SiteInfo
 from rayfix_tables.table import Table
 

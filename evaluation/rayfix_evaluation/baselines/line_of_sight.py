@@ -19,7 +19,7 @@ from rayfix_evaluation.paper.reports import PaperReport
 from rayfix_evaluation.paper.selection import RelativeLength
 from rayfix_service.fusion.measurements.directions import Direction
 from rayfix_service.fusion.measurements.report import Height, Report
-from rayfix_tables.angles import angles_of, wrap
+from rayfix_tables.geometry.angles import angles_of, wrap
 from rayfix_tables.site import SiteInfo
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from rayfix_evaluation.baselines.reports import sort_for_rivals, station_positio
 from rayfix_evaluation.paper.points import Launcher
 from rayfix_service.fusion.measurements.directions import Direction
 from rayfix_service.fusion.measurements.report import Report
-from rayfix_tables.angles import direction
+from rayfix_tables.geometry.angles import direction
 from rayfix_tables.site import SiteInfo
 from rayfix_tables.table import Table
 

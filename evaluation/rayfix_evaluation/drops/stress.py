@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from rayfix_tables.angles import angles_of, direction
+from rayfix_tables.geometry.angles import angles_of, direction
 
 _TOUCHING = 0.02
 """Parts of the scene whose boxes are this near to each other are one object, m."""

@@ -15,7 +15,7 @@ from rayfix_offline.scene.engine import EmbreeEngine, RayEngine
 from rayfix_offline.scene.materials import Reflectivity, constant_reflectivity
 from rayfix_offline.twin.planes import Planes, merge_coplanar
 from rayfix_service.fusion.measurements.directions import Direction
-from rayfix_tables.angles import direction
+from rayfix_tables.geometry.angles import direction
 from rayfix_tables.table import Table
 
 

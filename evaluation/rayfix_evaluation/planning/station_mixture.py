@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.angles import direction, wrap
+from rayfix_tables.geometry.angles import direction, wrap
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import TubeMixture, joint_cov, unpack
 

@@ -20,8 +20,8 @@ from rayfix_evaluation.drops.stress import (
     with_turned_stations,
 )
 from rayfix_evaluation.truth.forward import Paths
-from rayfix_tables.angles import direction
-from rayfix_tables.mounting import board_to_scene
+from rayfix_tables.geometry.angles import direction
+from rayfix_tables.geometry.mounting import board_to_scene
 from rayfix_tables.site import Station
 
 __all__ = ["Case", "Simulated", "World", "document_key", "in_view", "simulate_case"]

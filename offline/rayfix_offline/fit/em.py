@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit
 from rayfix_offline.fit.tubes import Fitted, fitted_cells
 from rayfix_offline.rays.trace import LevelRays
-from rayfix_tables.angles import tangent, wrap
+from rayfix_tables.geometry.angles import tangent, wrap
 from rayfix_tables.mixture import TubeMixture
 
 

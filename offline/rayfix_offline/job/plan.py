@@ -11,9 +11,9 @@ from rayfix_offline.job.shards import content_key
 from rayfix_offline.rays.trace import level_grid
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin.twin import Twin
-from rayfix_tables.angles import direction
 from rayfix_tables.disk.schema import ARRAYS_VERSION
-from rayfix_tables.mounting import board_to_scene
+from rayfix_tables.geometry.angles import direction
+from rayfix_tables.geometry.mounting import board_to_scene
 from rayfix_tables.site import Station
 
 BUILD_VERSION = 6

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.angles import direction
+from rayfix_tables.geometry.angles import direction
 from rayfix_tables.grid import AngularGrid
 
 

@@ -17,7 +17,7 @@ from rayfix_service.wire import MAX_MEASUREMENTS, FieldProblem, InvalidReportErr
 from rayfix_service.wire.documents import HeightDocument
 from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits
 from rayfix_tables.errors import ReportError
-from rayfix_tables.problems import Path, path_text
+from rayfix_tables.validation.problems import Path, path_text
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from rayfix_service.wire.documents import HeightDocument
 from rayfix_service.wire.fields import Rfc3339, misfit
 from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits, has_more_values
 from rayfix_service.wire.problems import invalid_report
-from rayfix_tables.problems import Path
+from rayfix_tables.validation.problems import Path
 
 _SHORT = 64 << 10
 """Bytes of a message up to which its values are not counted before the validation."""

@@ -14,8 +14,8 @@ from rayfix_service.fusion.measurements.report import Height
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.wire import fix_to_document, parse_report
-from rayfix_tables.problems import path_text
 from rayfix_tables.site import SiteInfo
+from rayfix_tables.validation.problems import path_text
 
 InputFormat = Literal["native", "nrppa", "silabs", "ublox"]
 OutputFormat = Literal["native", "3gpp", "omlox"]

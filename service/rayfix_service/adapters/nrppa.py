@@ -30,9 +30,9 @@ from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_i
 from rayfix_service.fusion.measurements.directions import to_scene
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, TimeOfArrival
 from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits
-from rayfix_tables.angles import wrap_one
-from rayfix_tables.problems import Path, path_text
+from rayfix_tables.geometry.angles import wrap_one
 from rayfix_tables.site import Station
+from rayfix_tables.validation.problems import Path, path_text
 
 _RESOLUTION_M = {"m0dot1": 0.1, "mdot1": 0.1, "m1": 1.0, "m10": 10.0, "m30": 30.0}
 

@@ -16,8 +16,8 @@ from rayfix_service.fusion.measurements.report import CONFIDENCE, Angle, Frame, 
 from rayfix_service.wire import MAX_MEASUREMENTS, MAX_REPORTS, WireModel
 from rayfix_service.wire.fields import Confidence, misfit
 from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits
-from rayfix_tables.angles import wrap_one
-from rayfix_tables.problems import Path
+from rayfix_tables.geometry.angles import wrap_one
+from rayfix_tables.validation.problems import Path
 
 _Stdev = Field(ge=0, le=360, description="a standard deviation in degrees, 0 to 360")
 

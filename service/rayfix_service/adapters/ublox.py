@@ -12,9 +12,9 @@ from rayfix_service.adapters.adapted import Adapted, Skipped, adapted_report, st
 from rayfix_service.adapters.transmissions import Joiner, Transmission
 from rayfix_service.fusion.measurements.report import Angle, ErrorModel
 from rayfix_service.wire import MAX_REPORTS, FieldProblem, InvalidReportError
-from rayfix_tables.angles import wrap_one
-from rayfix_tables.limits import Limits, check_limits
-from rayfix_tables.problems import Path, shown
+from rayfix_tables.geometry.angles import wrap_one
+from rayfix_tables.validation.limits import Limits, check_limits
+from rayfix_tables.validation.problems import Path, shown
 
 _PREFIX = "+UUDF:"
 

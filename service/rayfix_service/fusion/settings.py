@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from rayfix_tables.limits import Limits, check_limits
+from rayfix_tables.validation.limits import Limits, check_limits
 
 Probability = Annotated[float, Limits(above=0.0, below=1.0)]
 

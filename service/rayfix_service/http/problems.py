@@ -14,7 +14,7 @@ from rayfix_service.wire import FieldProblem, MalformedJsonError, more_problems,
 from rayfix_service.wire.limits import USUAL_LIMITS
 from rayfix_service.wire.problems import parameter_problem
 from rayfix_tables.errors import ReportError
-from rayfix_tables.problems import path_text
+from rayfix_tables.validation.problems import path_text
 
 MEDIA_TYPE = "application/problem+json"
 

@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.limits import Limits, check_limits
+from rayfix_tables.validation.limits import Limits, check_limits
 
 Array = NDArray[np.float64]
 Positive = Annotated[float, Limits(above=0.0)]

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from rayfix_service.tracking.motion import MotionModel, Positive
-from rayfix_tables.limits import Limits, check_limits
+from rayfix_tables.validation.limits import Limits, check_limits
 
 Count = Annotated[int, Limits(least=1)]
 

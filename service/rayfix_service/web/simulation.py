@@ -12,9 +12,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.angles import wrap
 from rayfix_tables.errors import ReportError
 from rayfix_tables.gaussians.definite import is_definite
+from rayfix_tables.geometry.angles import wrap
 from rayfix_tables.mixture import joint_cov
 from rayfix_tables.part import StationPart
 from rayfix_tables.table import Table

@@ -8,8 +8,8 @@ import numpy as np
 
 from rayfix_service.measuring.ranging import SPEED_OF_LIGHT
 from rayfix_service.web.simulation import SimulatedPath, simulate
-from rayfix_tables.angles import angles_of, direction, local_to_scene
 from rayfix_tables.errors import ReportError
+from rayfix_tables.geometry.angles import angles_of, direction, local_to_scene
 from rayfix_tables.table import Table
 
 _TRIES = 64

@@ -22,7 +22,7 @@ from rayfix_service.wire.problems import (
 from rayfix_service.wire.request import parse_report, read_json
 from rayfix_service.wire.response import FixDocument, fix_to_document
 from rayfix_service.wire.writing import report_to_document
-from rayfix_tables.problems import path_text
+from rayfix_tables.validation.problems import path_text
 
 __all__ = [
     "MAX_MEASUREMENTS",

@@ -12,7 +12,7 @@ from rayfix_service.wire.documents import MAX_REPORTS
 from rayfix_service.wire.limits import MAX_DEPTH, TOKEN, USUAL_LIMITS, MessageLimits
 from rayfix_service.wire.problems import FieldProblem, InvalidReportError, MalformedJsonError
 from rayfix_service.wire.request import read_json
-from rayfix_tables.problems import Path, path_text
+from rayfix_tables.validation.problems import Path, path_text
 
 _HEAD = re.compile(rb'\s*\{\s*"reports"\s*:\s*\[')
 

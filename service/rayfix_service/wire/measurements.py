@@ -44,7 +44,7 @@ from rayfix_service.wire.fields import (
     ZenithDeg,
     misfit,
 )
-from rayfix_tables.angles import wrap_one
+from rayfix_tables.geometry.angles import wrap_one
 
 
 class _WithErrorModel(WireModel):

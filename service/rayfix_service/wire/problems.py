@@ -20,7 +20,7 @@ from rayfix_service.wire.fields import MISFIT, WireModel
 from rayfix_service.wire.limits import USUAL_LIMITS, models_within, names_of, trimmed
 from rayfix_service.wire.measurements import MEASUREMENT_DOCUMENTS
 from rayfix_tables.errors import ReportError
-from rayfix_tables.problems import Path, path_text, shown, unknown_key
+from rayfix_tables.validation.problems import Path, path_text, shown, unknown_key
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,8 +6,8 @@ from typing import Annotated
 from pydantic import BaseModel, Field
 
 from rayfix_service.wire.points import Point
+from rayfix_tables.geometry.mounting import boresight_of
 from rayfix_tables.level import Level
-from rayfix_tables.mounting import boresight_of
 from rayfix_tables.site import Mounting, Station
 from rayfix_tables.table import Table
 

@@ -17,7 +17,7 @@ from rayfix_service.fusion.measurements.report import (
 from rayfix_service.wire.fields import METRES_PER_NANOSECOND
 from rayfix_service.wire.problems import FieldProblem, InvalidReportError
 from rayfix_service.wire.request import parse_report
-from rayfix_tables.angles import wrap_one
+from rayfix_tables.geometry.angles import wrap_one
 
 
 def report_to_document(report: Report) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from rayfix_evaluation.arrays.covariance import covariance, num_sources, smoothe
 from rayfix_evaluation.arrays.estimators import ESTIMATORS, delay_and_sum, esprit, music, mvdr, wave_powers
 from rayfix_evaluation.arrays.planar import PlanarArray, Signal, receive, to_cosines, to_scene_direction
 from rayfix_evaluation.truth.forward import Paths
-from rayfix_tables.angles import direction
+from rayfix_tables.geometry.angles import direction
 from rayfix_tables.site import Station
 
 Array = NDArray[np.float64]

@@ -21,8 +21,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, TimeDifference, TimeOfArrival
-from rayfix_tables.angles import angles_of
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.geometry.angles import angles_of
 from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table

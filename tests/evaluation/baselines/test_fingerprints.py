@@ -8,7 +8,7 @@ import pytest
 
 from rayfix_evaluation.baselines.fingerprints import Fingerprinting, RadioMap, simulate_map
 from rayfix_service.fusion.measurements.report import Report
-from rayfix_tables.angles import direction
+from rayfix_tables.geometry.angles import direction
 from rayfix_tables.table import Table
 from tests.support.every_rival import every_rival
 

@@ -13,7 +13,7 @@ from rayfix_evaluation.drops.stress import (
     with_scaled_stdevs,
     with_turned_stations,
 )
-from rayfix_tables.angles import direction
+from rayfix_tables.geometry.angles import direction
 
 REPORT: dict[str, Any] = {
     "target_id": "ue",

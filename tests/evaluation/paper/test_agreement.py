@@ -21,7 +21,7 @@ from rayfix_service.fusion.product.factors import make_factor
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
-from rayfix_tables.angles import angles_of
+from rayfix_tables.geometry.angles import angles_of
 from rayfix_tables.table import Table
 
 Array = NDArray[np.float64]

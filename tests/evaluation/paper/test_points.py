@@ -10,7 +10,7 @@ from rayfix_offline.scene.engine import EmbreeEngine
 from rayfix_offline.scene.materials import constant_reflectivity
 from rayfix_offline.twin.planes import merge_coplanar
 from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
-from rayfix_tables.angles import angles_of
+from rayfix_tables.geometry.angles import angles_of
 
 STATION = np.array([1.0, 2.0, 1.5])
 ROOM = np.array([[0.0, 0.0, 0.0], [4.0, 5.0, 3.0]])

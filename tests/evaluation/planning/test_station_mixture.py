@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from rayfix_evaluation.drops.accuracy import solver_of
 from rayfix_evaluation.drops.bound import path_gradients
 from rayfix_evaluation.planning.station_mixture import audible_paths
-from rayfix_tables.angles import angles_of, wrap
+from rayfix_tables.geometry.angles import angles_of, wrap
 from rayfix_tables.table import Table
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit, TubeFit
 from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_offline.site import parse_site
-from rayfix_tables.angles import direction
+from rayfix_tables.geometry.angles import direction
 from rayfix_tables.mixture import FIELD_SHAPES, unpack
 from tests.support.rooms import CABINET, ROOM, finest_level, scene_of_boxes
 

@@ -16,7 +16,7 @@ from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit, TubeFit
 from rayfix_offline.fit.tubes import Fitted, fit_tubes, fitted_cells
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_offline.site import parse_site
-from rayfix_tables.angles import direction, tangent
+from rayfix_tables.geometry.angles import direction, tangent
 from rayfix_tables.mixture import TubeMixture, unpack, widening_cov
 from tests.support.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_boxes
 

@@ -15,8 +15,8 @@ from rayfix_offline.rays.pieces import cut_pieces
 from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments
 from rayfix_offline.rays.trace import LevelRays
-from rayfix_tables.angles import tangent
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.geometry.angles import tangent
 from rayfix_tables.grid import AngularGrid
 from tests.support.rooms import CABINET, ROOM
 from tests.support.shapes import box

@@ -8,8 +8,8 @@ import trimesh
 
 from rayfix_offline.build import BuildSummary, build_table
 from rayfix_tables.errors import BuildError, TableError
+from rayfix_tables.geometry.mounting import boresight_of
 from rayfix_tables.mixture import FIELD_SHAPES
-from rayfix_tables.mounting import boresight_of
 from rayfix_tables.table import Table
 
 SITE = """\

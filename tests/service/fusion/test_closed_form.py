@@ -18,8 +18,8 @@ from rayfix_service.fusion.measurements.report import (
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.locator import Locator
-from rayfix_tables.angles import direction
 from rayfix_tables.errors import ReportError
+from rayfix_tables.geometry.angles import direction
 from rayfix_tables.site import Station, StationBias
 from tests.support.gaussian_oracle import Posterior, oracle
 from tests.support.hand_reports import EXACT, TUBES, angle_of, differences, measured, report_of

@@ -31,7 +31,7 @@ from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
-from rayfix_tables.angles import angles_of, direction, local_to_scene
+from rayfix_tables.geometry.angles import angles_of, direction, local_to_scene
 from rayfix_tables.table import Table
 from tests.support import kernel_twins
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.measurements.directions import to_scene, without_bias
 from rayfix_service.fusion.measurements.report import Angle, Range, Report
-from rayfix_tables.angles import direction, wrap_one
+from rayfix_tables.geometry.angles import direction, wrap_one
 from rayfix_tables.site import SiteInfo
 
 Array = NDArray[np.float64]

@@ -5,7 +5,7 @@ from functools import lru_cache
 
 from rayfix_service.fusion.measurements.directions import without_bias
 from rayfix_service.fusion.measurements.report import Angle, Range
-from rayfix_tables.angles import local_to_scene
+from rayfix_tables.geometry.angles import local_to_scene
 from rayfix_tables.site import Station
 
 Vector = tuple[float, float, float]

@@ -16,7 +16,7 @@ from rayfix_service.fusion.diagnosis.common_turn import ProposedTurn, common_tur
 from rayfix_service.fusion.measurements.directions import to_scene, without_bias
 from rayfix_service.fusion.measurements.report import Angle, Range, Report
 from rayfix_service.fusion.posterior.fix import Fix
-from rayfix_tables.angles import angles_of, wrap_one
+from rayfix_tables.geometry.angles import angles_of, wrap_one
 from rayfix_tables.site import SiteInfo, Station
 
 Relocate = Callable[[Report, Mapping[str, float]], Fix]

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.lookup.partition_of_unity import sum_of_ellipse, sum_of_meridian
 from rayfix_service.fusion.measurements.directions import Direction
-from rayfix_tables.angles import wrap
 from rayfix_tables.gaussians.constants import LOG_2PI
+from rayfix_tables.geometry.angles import wrap
 from rayfix_tables.level import WINDOW_RATIO, Level
 
 _SUM_REACH = 3.0

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_tables.angles import angles_of, direction, tangent, wrap
 from rayfix_tables.gaussians.constants import LOG_2PI
+from rayfix_tables.geometry.angles import angles_of, direction, tangent, wrap
 from rayfix_tables.grid import AngularGrid
 
 _REACH = 3.5

@@ -16,8 +16,8 @@ from rayfix_service.fusion.measurements.report import (
     TimeOfArrival,
 )
 from rayfix_tables.errors import ReportError
-from rayfix_tables.limits import Limits
-from rayfix_tables.problems import path_text
+from rayfix_tables.validation.limits import Limits
+from rayfix_tables.validation.problems import path_text
 
 _FINITE = Limits()
 _STDEV = Limits(above=0.0)

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.measurements.report import Angle
-from rayfix_tables.angles import angles_of, direction, local_to_scene
-from rayfix_tables.mounting import board_to_scene
+from rayfix_tables.geometry.angles import angles_of, direction, local_to_scene
+from rayfix_tables.geometry.mounting import board_to_scene
 from rayfix_tables.site import NO_BIAS, Station
 
 

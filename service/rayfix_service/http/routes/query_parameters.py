@@ -10,7 +10,7 @@ from starlette.requests import HTTPConnection
 from rayfix_service.http.problems import INVALID_PARAMETER, ProblemError
 from rayfix_service.wire import FieldProblem
 from rayfix_service.wire.limits import USUAL_LIMITS
-from rayfix_tables.problems import shown
+from rayfix_tables.validation.problems import shown
 
 
 async def refuse_unknown_parameters(connection: HTTPConnection) -> None:

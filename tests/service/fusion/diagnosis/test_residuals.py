@@ -8,7 +8,7 @@ import pytest
 from rayfix_service.fusion.diagnosis.residuals import angle_residual, range_residual
 from rayfix_service.fusion.measurements.directions import to_scene
 from rayfix_service.fusion.measurements.report import Angle, Range
-from rayfix_tables.angles import angles_of, direction, local_to_scene
+from rayfix_tables.geometry.angles import angles_of, direction, local_to_scene
 from rayfix_tables.site import Station, StationBias
 
 NORTH = 0.4

@@ -14,7 +14,7 @@ from rayfix_service.fusion.measurements.report import Angle, Frame, Measurement,
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.locator import Locator
-from rayfix_tables.angles import angles_of, local_to_scene
+from rayfix_tables.geometry.angles import angles_of, local_to_scene
 from rayfix_tables.site import Station
 from rayfix_tables.table import Table
 

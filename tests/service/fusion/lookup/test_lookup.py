@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.lookup.lookup import SUM_RATIO, Lookup, look_up
 from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
-from rayfix_tables.angles import angles_of, local_to_scene, wrap
-from rayfix_tables.angles import direction as direction_of
+from rayfix_tables.geometry.angles import angles_of, local_to_scene, wrap
+from rayfix_tables.geometry.angles import direction as direction_of
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture

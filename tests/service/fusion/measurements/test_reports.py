@@ -28,8 +28,8 @@ from rayfix_service.fusion.measurements.report import (
     TimeDifference,
     TimeOfArrival,
 )
-from rayfix_tables.angles import direction, local_to_scene, wrap
 from rayfix_tables.errors import ReportError
+from rayfix_tables.geometry.angles import direction, local_to_scene, wrap
 from rayfix_tables.site import SiteInfo, Station, StationBias
 
 ORIGIN = (0.0, 0.0, 0.0)

@@ -7,7 +7,7 @@ import pytest
 
 from rayfix_service.fusion.measurements.report import Measurement
 from rayfix_service.locator import Locator
-from rayfix_tables.angles import angles_of
+from rayfix_tables.geometry.angles import angles_of
 from tests.support.hand_reports import angle_of, report_of
 from tests.support.hand_tables import POSITIONS, SIDE, UE, MakeTable, line_of_sight
 

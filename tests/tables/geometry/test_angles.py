@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rayfix_tables.angles import angles_of, direction, local_to_scene, tangent, wrap, wrap_one
+from rayfix_tables.geometry.angles import angles_of, direction, local_to_scene, tangent, wrap, wrap_one
 
 ROUNDING = 1e-15  # of numbers of size 1
 angles = st.floats(-1e4, 1e4)

@@ -5,8 +5,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from rayfix_tables.angles import local_to_scene
-from rayfix_tables.mounting import FRAMES, Boresight, board_to_scene, boresight_of, orientation_of
+from rayfix_tables.geometry.angles import local_to_scene
+from rayfix_tables.geometry.mounting import FRAMES, Boresight, board_to_scene, boresight_of, orientation_of
 from rayfix_tables.site import Mounting, Station
 
 DEG = np.pi / 180

@@ -12,7 +12,7 @@ from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.tracking.motion import MotionModel
 from rayfix_service.tracking.settings import TrackingSettings
 from rayfix_tables.errors import RayfixError, SettingsError
-from rayfix_tables.limits import Limits, _limited_fields, check_limits
+from rayfix_tables.validation.limits import Limits, _limited_fields, check_limits
 
 SETTINGS = [FusionSettings, TrackingSettings, MotionModel, RetryPolicy]
 WITHOUT_LIMITS = {"motion"}

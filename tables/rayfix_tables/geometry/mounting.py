@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rayfix_tables.angles import Array, angles_of, local_to_scene
+from rayfix_tables.geometry.angles import Array, angles_of, local_to_scene
 from rayfix_tables.site import Mounting, Station
 
 Axis = tuple[float, float, float]
@@ -53,7 +53,7 @@ def orientation_of(mounting: Mounting, boresight: Boresight, roll: float) -> tup
     Returns
     -------
     tuple of 3 floats, rad
-        Bearing, downtilt and slant of 3GPP TR 38.901; see :func:`rayfix_tables.angles.local_to_scene`.
+        Bearing, downtilt and slant of 3GPP TR 38.901; see :func:`rayfix_tables.geometry.angles.local_to_scene`.
     """
     if FRAMES[mounting] == FRAMES["3gpp"]:
         return (*boresight, roll)

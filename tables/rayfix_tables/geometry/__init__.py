@@ -1,0 +1,1 @@
+"""Angles, frames, and how arrays are mounted."""
