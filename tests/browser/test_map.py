@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rayfix_offline.build import build_table
-from tests.rayfix.test_map_coordinates import POSITIONS, SHIFT, UE, report, write_site
+from tests.support.map_site import POSITIONS, SHIFT, UE, report, write_site
 from tests.support.server_process import start_rayfix_serve
 
 

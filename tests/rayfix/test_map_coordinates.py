@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import httpx
 import numpy as np
 import pytest
-import trimesh
 from numpy.typing import NDArray
 
 import rayfix
@@ -27,15 +26,12 @@ from rayfix.cli import main
 from rayfix_offline.build import build_table
 from rayfix_offline.check import check_site
 from rayfix_tables.table import Table
+from tests.support.map_site import POSITIONS, SHIFT, UE, report, write_site
 from tests.support.running_app import RunningApp
-from tests.support.sites import stations_text
 
 Array = NDArray[np.float64]
 
-SHIFT = np.array([500_000.0, 5_400_000.0, 300.0])
-UE = np.array([5.1, 6.2, 1.3])
 MILLIMETRE = 1e-3
-POSITIONS = {"a": (0.3, 0.4, 2.6), "b": (7.6, 0.3, 2.5), "c": (7.7, 9.6, 2.6)}
 
 
 class Sites(NamedTuple):
@@ -43,27 +39,6 @@ class Sites(NamedTuple):
 
     near: Path
     far: Path
-
-
-def write_site(folder: Path, shift: Array) -> Path:
-    """Write the site moved by a vector; its scene as text, in double precision."""
-    room = trimesh.creation.box(bounds=[(0, 0, 0), (8, 10, 3)])
-    room.invert()
-    pillar = trimesh.creation.box(bounds=[(2, 3, 0), (3, 4, 2.2)])
-    lines, count = [], 1
-    for name, mesh in (("room", room), ("pillar", pillar)):
-        lines += [f"o {name}", *(f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.vertices + shift)]
-        lines += [f"f {a} {b} {c}" for a, b, c in mesh.faces + count]
-        count += len(mesh.vertices)
-    folder.mkdir()
-    (folder / "room.obj").write_text("\n".join(lines))
-    path = folder / "site.toml"
-    path.write_text(
-        '[site]\nname = "room"\nscene = "room.obj"\n[propagation]\nmax_reflections = 1\nmax_path_length_m = 40\n'
-        "[table]\nwindows_deg = [7.5, 15]\n"
-        + stations_text({name: tuple((np.array(p) + shift).round(4).tolist()) for name, p in POSITIONS.items()})
-    )
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -91,27 +66,6 @@ def service(sites: Sites) -> Iterator[RunningApp]:
     """Serve the far table."""
     with RunningApp(sites.far.with_suffix(".h5"), simulation=True) as app:
         yield app
-
-
-def report(ue: Array = UE, *, height: float | None = None, **more: Any) -> dict[str, Any]:
-    """Return what the stations measure of the UE, which is the same here and there."""
-    measurements: list[dict[str, Any]] = []
-    for name, position in POSITIONS.items():
-        apart = ue - position
-        length = float(np.linalg.norm(apart))
-        measurements += [
-            {
-                "type": "aoa",
-                "station_id": name,
-                "azimuth_deg": float(np.rad2deg(np.arctan2(apart[1], apart[0]))),
-                "zenith_deg": float(np.rad2deg(np.arccos(apart[2] / length))),
-                "azimuth_stdev_deg": 1.5,
-                "zenith_stdev_deg": 1.5,
-            },
-            {"type": "pt", "station_id": name, "range_m": length, "stdev_m": 0.2},
-        ]
-    known = {} if height is None else {"height": {"z_m": height, "stdev_m": 0.05}}
-    return {"measurements": measurements, **known, **more}
 
 
 def vector(point: dict[str, float]) -> Array:
