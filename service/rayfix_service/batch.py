@@ -11,8 +11,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
-from joblib import Parallel, delayed, effective_n_jobs
-
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.settings import FusionSettings
@@ -68,6 +66,9 @@ def locate_batch(
 
 def _locate_all(locator: _Locates, reports: Sequence[Report | Mapping[str, Any]], jobs: int) -> list[Fix | ReportError]:
     blocks = [reports[begin : begin + _BLOCK] for begin in range(0, len(reports), _BLOCK)]
+    # Imported here: a service answers without it.
+    from joblib import Parallel, delayed, effective_n_jobs
+
     jobs = min(effective_n_jobs(jobs), len(blocks))
     if jobs < 2:
         return _locate_block(locator, reports)

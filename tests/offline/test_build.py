@@ -125,7 +125,7 @@ def test_every_stage_counts_up_to_all_of_its_work(site_path: Path, tmp_path: Pat
         done = [count for stage, count, _ in calls if stage in group]
         (whole,) = {whole for stage, _, whole in calls[1:] if stage in group}
         assert done == sorted(done)
-        assert len(set(done)) > 3  # it moves
+        assert len(set(done)) > 2  # it moves
         assert (done[0], done[-1]) == (0, whole)
         assert group & {"balancing", "writing"} or whole == total
     assert any("bs1" in stage for stage in stages)

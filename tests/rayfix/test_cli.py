@@ -342,6 +342,6 @@ def test_an_inconsistent_fix_is_shown_without_probabilities(capsys: pytest.Captu
     assert "%" not in out
 
 
-@pytest.mark.parametrize(("given", "prefix"), [([], ""), (["--root-path", "/"], ""), (["--root-path", "/a/"], "/a")])
-def test_a_service_needs_no_prefix(given: list[str], prefix: str) -> None:
+@pytest.mark.parametrize(("given", "prefix"), [([], None), (["--root-path", "/"], ""), (["--root-path", "/a/"], "/a")])
+def test_a_service_needs_no_prefix(given: list[str], prefix: str | None) -> None:
     assert make_parser().parse_args(["serve", "T.h5", *given]).root_path == prefix

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from rayfix_tables.checked import open_checked
-from tests.offline.job.test_resume import write_site
 from tests.support.full_disk import mounted, needs_mounts, temporary_folders
+from tests.support.small_sites import write_site
 
 LIST = 'exec 3>&1; "$@"; status=$?; find "$0" -type f -exec basename {} \\; >&3; exit $status'
 """Run a command and list the files of a folder, which ends with the command."""

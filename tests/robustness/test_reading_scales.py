@@ -18,9 +18,9 @@ from rayfix_service.adapters.transmissions import Joiner
 from rayfix_service.adapters.ublox import parse_ublox
 from rayfix_service.batch import locate_batch
 from rayfix_service.fusion.posterior.fix import Fix, Outcome
-from rayfix_service.http.routes.positions import split_batch
 from rayfix_service.locator import Locator
 from rayfix_service.wire import FieldProblem, InvalidReportError, fix_to_document, parse_report, problems_of
+from rayfix_service.wire.batches import split_batch
 from rayfix_service.wire.limits import USUAL_LIMITS, has_more_values
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station

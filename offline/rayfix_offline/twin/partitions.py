@@ -114,7 +114,9 @@ def _samples(scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.float64], NDAr
     chosen = np.flatnonzero(upright & ~heavy[scene.face_materials])
     spacing = _spacing(scene)
     longest = np.stack([np.linalg.norm(p[chosen] - q[chosen], axis=1) for p, q in ((a, b), (b, c), (c, a))]).max(axis=0)
-    parts = np.maximum(np.ceil(longest / spacing), 1.0).astype(np.int64)
+    # A sliver, however long, has no more samples than a triangle of its area and of good proportions has, times 16.
+    most = 8.0 + 4.0 * np.sqrt(length[chosen]) / spacing
+    parts = np.clip(np.ceil(longest / spacing), 1.0, np.ceil(most)).astype(np.int64)
     face, point = [], []
     for count in np.unique(parts):
         mine = chosen[parts == count]

@@ -59,7 +59,12 @@ BY_CHECKSUM = "what it decides, the scene's triangles or the free space, is in t
 DEFINITION = "part of a definition or a unit, not a choice"
 SAME_BITS = "changes memory or time only, no bit of the table"
 
+WAITING = "how long something is waited for"
+
 NOT_IN_IDENTITY = {
+    "offline.job.cluster.LOOK_SECONDS": WAITING,
+    "offline.job.cluster_workers.ANSWER_SECONDS": WAITING,
+    "offline.job.cluster_workers.LEFT_SECONDS": WAITING,
     "offline.scene.placed.MOST_TRIANGLES": "a limit on what is read; beyond it the file is refused",
     "offline.scene.polygons.FLAT": CHECK_ONLY,
     "offline.scene.polygons._IN_LINE": BY_CHECKSUM,

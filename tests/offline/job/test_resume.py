@@ -18,30 +18,9 @@ from rayfix_offline.job.shards import ShardStore
 from rayfix_tables.errors import BuildError
 from rayfix_tables.site import NO_BIAS
 from rayfix_tables.table import Table
-from tests.support.rooms import room_with_crate
-from tests.support.sites import stations_text
+from tests.support.small_sites import write_site
 
-SITE = """\
-[site]
-name = "room"
-scene = "room.ply"
-[propagation]
-max_reflections = 1
-max_path_length_m = 20.0
-[table]
-windows_deg = [6.0, 15.0]
-seed = {seed}
-"""
 STATIONS = {"a": (0.4, 0.5), "b": (3.5, 0.6), "c": (2.0, 4.5)}
-
-
-def write_site(folder: Path, stations: dict[str, tuple[float, float]], *, seed: int = 1, box: float = 1.0) -> Path:
-    """Write a room of 4 x 5 x 3 m with a box of 1 x 1 m in it, ``box`` m high, and its site file."""
-    folder.mkdir(exist_ok=True)
-    room_with_crate(box).export(folder / "room.ply")
-    text = SITE.format(seed=seed) + stations_text({name: (x, y, 2.5) for name, (x, y) in stations.items()})
-    (folder / "site.toml").write_text(text, encoding="utf-8")
-    return folder / "site.toml"
 
 
 @pytest.fixture(scope="module")
@@ -205,14 +184,16 @@ def test_a_balance_is_kept_with_its_part_and_made_where_there_is_none(
 ) -> None:
     site, table = write_site(tmp_path, STATIONS), tmp_path / "t.h5"
     with monkeypatch.context() as early:
-        early.setattr(build, "balanced", lambda level, free_space, settings: level)  # as the first tables were
+        early.setattr(
+            build, "balanced", lambda level, free_space, settings, *, advance: level
+        )  # as the first tables were
         unbalanced = build_table(site, table, jobs=1)
     assert unbalanced.table_id != whole.table_id
     again = build_table(site, table, jobs=1)
     assert set(origins(again).values()) == {"kept"}
     assert again.table_id == whole.table_id
     with monkeypatch.context() as idle:
-        idle.setattr(build, "balanced", lambda level, free_space, settings: pytest.fail("balanced anew"))
+        idle.setattr(build, "balanced", lambda level, free_space, settings, *, advance: pytest.fail("balanced anew"))
         assert build_table(site, table, jobs=1).table_id == whole.table_id
 
 

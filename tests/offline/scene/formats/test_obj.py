@@ -35,7 +35,7 @@ def test_a_doorway_stays_open(first: int, relative: bool, tmp_path: Path) -> Non
     (tmp_path / "a.obj").write_text(obj_of({"hall": hall(), "wall": partition(first=first)}, relative=relative))
     (tmp_path / "site.toml").write_text(SITE.format("a.obj"))
     twin = prepare_twin(read_site(tmp_path / "site.toml"), tmp_path)
-    assert twin.findings == ()
+    assert [finding.kind for finding in twin.findings] == ["thin partition"]
     assert twin.scene.objects == ("hall", "wall")
     # Voxels of 0.25 m at most: the partition is thinner.
     assert len(twin.scene.faces) == 12 + 2 * 6 + 8 * 2
