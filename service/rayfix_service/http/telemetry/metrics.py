@@ -196,7 +196,7 @@ def share_figures() -> None:
     prometheus-client reads the variable when it is imported, which is before there are workers. Where the folder has no
     room or is gone, the figures of this process are in its memory, and a warning says so.
     """
-    values.MmapedDict = ReservedDict  # type: ignore[misc]
+    values.MmapedDict = ReservedDict  # type: ignore[attr-defined]
     values.ValueClass = values.get_value_class()  # type: ignore[no-untyped-call]
 
 
