@@ -7,8 +7,20 @@ from pathlib import Path
 import pytest
 
 from rayfix_tables.checked import open_checked
-from tests.offline.job.test_resume import write_site
 from tests.support.full_disk import mounted, needs_mounts, temporary_folders
+from tests.support.rooms import room_with_crate
+from tests.support.sites import stations_text
+
+SITE = """\
+[site]
+name = "room"
+scene = "room.ply"
+[propagation]
+max_reflections = 1
+max_path_length_m = 20.0
+[table]
+windows_deg = [6.0, 15.0]
+"""
 
 LIST = 'exec 3>&1; "$@"; status=$?; find "$0" -type f -exec basename {} \\; >&3; exit $status'
 """Run a command and list the files of a folder, which ends with the command."""
@@ -17,7 +29,11 @@ LIST = 'exec 3>&1; "$@"; status=$?; find "$0" -type f -exec basename {} \\; >&3;
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
     """Write a room with one station."""
-    return write_site(tmp_path / "room", {"a": (0.4, 0.5)})
+    folder = tmp_path / "room"
+    folder.mkdir()
+    room_with_crate().export(folder / "room.ply")
+    (folder / "site.toml").write_text(SITE + stations_text({"a": (0.4, 0.5, 2.5)}))
+    return folder / "site.toml"
 
 
 def building(site: Path, table: Path) -> list[str]:
