@@ -173,11 +173,11 @@ def post(port: int, message: Message, times: LoopTimes) -> Answered:
     return Answered(status=status, seconds=seconds, processor=processor, wall=wall)
 
 
-def climb(send: Callable[[Message], Answered], searches: list[Search], until: float) -> None:
-    """Take turns of the searches until a moment, each from its costliest message since its last new beginning."""
+def climb(send: Callable[[Message], Answered], searches: list[Search], *, goes_on: Callable[[], bool]) -> None:
+    """Take turns of the searches, each from its costliest message since its last new beginning."""
     best: dict[int, tuple[Message, tuple[float, float]]] = {}
     step = 0
-    while time.monotonic() < until:
+    while goes_on():
         for number, search in enumerate(searches):
             new = step % RESTART == 0
             message = search.begin() if new else search.change(best[number][0])
@@ -186,6 +186,23 @@ def climb(send: Callable[[Message], Answered], searches: list[Search], until: fl
             if new or cost >= best[number][1]:
                 best[number] = message, cost
         step += 1
+
+
+def all_searches(locator: Locator, seed: int) -> list[Search]:
+    """Return the searches in the order of their turns."""
+    rng = np.random.default_rng(seed)
+    reports = ReportSearch([station.id for station in locator.table.site.stations], rng)
+    return [reports, MessageSearch(rng), BatchSearch(reports, locator, rng), MessageSearch(rng)]
+
+
+def fault_of(message: Message, answer: Answered, slack: float) -> str | None:
+    """Return what is wrong with an answer."""
+    what = f"{message.path} {answer.status}, {len(message.body)} bytes: {message.body[:120]!r}"
+    if message.path == "/v1/positions" and answer.seconds > ServiceSettings.fix_seconds + slack:
+        return f"{answer.seconds:.1f} s for {what}"
+    if not (200 <= answer.status < 500 or answer.status in (503, 504)):
+        return f"answered {answer.status}: {what}"
+    return None
 
 
 def main() -> None:
@@ -225,7 +242,6 @@ def main() -> None:
 
 def attack(locator: Locator, folder: Path, options: Any) -> tuple[Found, Waits]:
     """Search for as long as is wanted."""
-    stations = [station.id for station in locator.table.site.stations]
     table, times = locator.table.path, LoopTimes(folder / "times")
     command = [
         "-m",
@@ -245,18 +261,13 @@ def attack(locator: Locator, folder: Path, options: Any) -> tuple[Found, Waits]:
             found.processor = sorted([*found.processor, (answer.processor, what)], reverse=True)[:20]
             found.waits = sorted([*found.waits, (livez.take(), what)], reverse=True)[:20]
             found.seconds = sorted([*found.seconds, (answer.seconds, what)], reverse=True)[:20]
-            limit = ServiceSettings.fix_seconds + options.slack
-            if message.path == "/v1/positions" and answer.seconds > limit:
-                found.faults.append(f"{answer.seconds:.1f} s for {what}")
-            if not (200 <= answer.status < 500 or answer.status in (503, 504)):
-                found.faults.append(f"answered {answer.status}: {what}")
+            if (fault := fault_of(message, answer, options.slack)) is not None:
+                found.faults.append(fault)
             return answer
 
-        rng = np.random.default_rng(options.seed)
-        reports = ReportSearch(stations, rng)
         until = time.monotonic() + 60.0 * options.minutes
         try:
-            climb(send, [reports, MessageSearch(rng), BatchSearch(reports, locator, rng), MessageSearch(rng)], until)
+            climb(send, all_searches(locator, options.seed), goes_on=lambda: time.monotonic() < until)
         finally:
             waits = livez.close()
     return found, waits

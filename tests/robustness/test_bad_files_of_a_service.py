@@ -165,13 +165,14 @@ def test_odd_names_and_kinds_of_files_harm_nothing(table: Path, tmp_path: Path, 
     (tmp_path / "folder.h5").mkdir()
     (tmp_path / "dangling.h5").symlink_to("nothing")
     (tmp_path / "zero.h5").symlink_to("/dev/zero")
+    (tmp_path / "circle.h5").symlink_to("circle.h5")
     put(table, tmp_path / "gr\u00fcn.h5")
     with caplog.at_level(logging.INFO), watching(tmp_path) as service:
         for path in ("/readyz", "/v1/tables", "/metrics"):
             assert service.get(path).status_code == 200, path
         assert names(service) == ["gr\u00fcn"]
         expected = {"caf\\udce9", "two\\nlines", "bell\\x07", "right\\u202eleft", "\\x1b[31mred"}
-        assert set(refused(service)) == expected | {"pipe", "folder", "dangling", "zero"}
+        assert set(refused(service)) == expected | {"pipe", "folder", "dangling", "zero", "circle"}
         refusal = service.post("/v1/tables/reload")
         assert refusal.status_code == 409
         errors = refusal.json()["errors"]
@@ -180,7 +181,7 @@ def test_odd_names_and_kinds_of_files_harm_nothing(table: Path, tmp_path: Path, 
         service.run(asyncio.sleep(5 * POLL))
     lines = [record.getMessage() for record in caplog.records if record.name.startswith("rayfix_service")]
     assert all(line.isprintable() for line in lines)
-    assert sum("table refused" in line for line in lines) == len(ODD_NAMES) + 4
+    assert sum("table refused" in line for line in lines) == len(ODD_NAMES) + 5
 
 
 def test_a_check_is_ended_with_its_service(hanging: Path, table: Path, tmp_path: Path):

@@ -315,10 +315,12 @@ def test_what_is_no_regular_file_is_never_opened(table_path: Path, tmp_path: Pat
     os.mkfifo(tmp_path / "pipe.h5")
     (tmp_path / "folder.h5").mkdir()
     (tmp_path / "dangling.h5").symlink_to("nothing")
+    (tmp_path / "circle.h5").symlink_to("circle.h5")
     (tmp_path / "device.h5").symlink_to("/dev/zero")
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(tmp_path / "socket.h5"))
     kinds = {"pipe": "a named pipe", "folder": "a folder", "dangling": "a symbolic link to nothing"}
+    kinds["circle"] = "a symbolic link that leads back to itself"
     for name, what in {**kinds, "device": "a device", "socket": "a socket"}.items():
         path = tmp_path / f"{name}.h5"
         assert what in refused_in_a_line(path, kind=NotATableError)

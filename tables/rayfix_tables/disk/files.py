@@ -1,5 +1,6 @@
 """A table's file as the system knows it: looked at before it is opened, and never anything but a regular file."""
 
+import errno
 import os
 import stat
 from collections.abc import Iterator
@@ -68,6 +69,10 @@ def why_not_regular(path: Path) -> str | None:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
         return "is a symbolic link to nothing" if path.is_symlink() else None
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            return "is a symbolic link that leads back to itself"
+        raise
     if stat.S_ISREG(mode):
         return None
     kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}

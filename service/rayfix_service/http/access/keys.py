@@ -17,9 +17,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rayfix_service.http.errors import ServiceError
+from rayfix_tables.disk.files import why_not_regular
 
 _log = logging.getLogger(__name__)
 
+_MOST_BYTES = 1 << 20  # of a key file
 _LINE = re.compile(r"([A-Za-z0-9._-]{1,64}):([0-9a-f]{64})")
 
 
@@ -119,7 +121,7 @@ def read_key_file(path: Path) -> dict[str, str]:
 
 def _read_hashes(path: Path) -> dict[str, str]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = _read_regular(path).decode("utf-8").splitlines()
     except OSError as error:
         raise ServiceError(
             f"the key file {path} cannot be read ({error.strerror}); make one with 'rayfix api-key NAME -o {path}'"
@@ -138,6 +140,18 @@ def _read_hashes(path: Path) -> dict[str, str]:
             raise ServiceError(f"{path} line {number} has the name {name} again; give each key a name of its own")
         hashes[name] = digest
     return hashes
+
+
+def _read_regular(path: Path) -> bytes:
+    """Read a file; a pipe may have no end, nor anyone who writes to it, and holds up whoever opens it."""
+    if (what := why_not_regular(path)) is not None and path.exists():
+        raise ServiceError(f"the key file {path} {what}; give a file that 'rayfix api-key NAME -o FILE' has made")
+    # Another may have taken its place since: it is not waited for.
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        content = file.read(_MOST_BYTES + 1)
+    if len(content) > _MOST_BYTES:
+        raise ServiceError(f"the key file {path} has more than {_MOST_BYTES} bytes; take out keys that are not used")
+    return content
 
 
 def add_key(path: Path, name: str) -> str:

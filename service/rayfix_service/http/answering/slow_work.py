@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from typing import Protocol, TypeVar
 
@@ -88,8 +89,11 @@ class SlowWork:
         self._under_way += 1
         stop = Stop()
         loop = asyncio.get_running_loop()
-        work = loop.run_in_executor(self._executor, partial(locate, report, stop=stop))
-        work.add_done_callback(self._done)
+        computed = self._executor.submit(partial(locate, report, stop=stop))
+        # Of the thread's work and not of the task that waits for it, which may end before: it is a thread that is busy.
+        computed.add_done_callback(lambda _: _soon(loop, self._done))
+        work = asyncio.wrap_future(computed, loop=loop)
+        work.add_done_callback(_retrieved)
         try:
             # A thread cannot be ended: what is given up counts as under way until it has stopped.
             return await asyncio.wait_for(asyncio.shield(work), max(self._seconds - spent, 0.0))
@@ -100,13 +104,22 @@ class SlowWork:
         finally:
             # Also when the request was cancelled.
             stop.set()
-            work.cancel()  # if it has not begun
+            computed.cancel()  # if it has not begun
 
-    def _done(self, work: "asyncio.Future[T]") -> None:
+    def _done(self) -> None:
         self._under_way -= 1
-        if not work.cancelled():
-            work.exception()  # retrieved, also of one that was given up
 
     def close(self) -> None:
         """End the threads."""
         self._executor.shutdown(wait=False, cancel_futures=True)
+
+
+def _soon(loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
+    with suppress(RuntimeError):  # the loop is closed
+        loop.call_soon_threadsafe(call)
+
+
+def _retrieved(work: "asyncio.Future[T]") -> None:
+    """Take the error of work that was given up."""
+    if not work.cancelled():
+        work.exception()
