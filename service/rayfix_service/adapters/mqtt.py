@@ -1,4 +1,4 @@
-"""Locating from an MQTT broker: angles in, positions out. Needs the extra ``rayfix[mqtt]``."""
+"""Locate from an MQTT broker: subscribes to angles and publishes positions. Needs the extra ``rayfix[mqtt]``."""
 
 import asyncio
 import json
@@ -48,7 +48,7 @@ class Broker:
 
 @dataclass(frozen=True, kw_only=True)
 class MqttSettings:
-    """What is read, how it is joined, and what is published.
+    """What to subscribe to, how to join messages, and what to publish.
 
     Attributes
     ----------
@@ -59,19 +59,19 @@ class MqttSettings:
     output : {"native", "3gpp", "omlox"}
         Format of positions.
     window : float, s
-        How long a packet waits for more locators.
+        How long to wait for more locators' angles of a packet.
     stations : Mapping
-        Stations by locator, for those that are not stations' identifiers.
+        Stations by locator; a locator that is not in the map is itself a station's identifier.
     frame : {"lcs", "scene", "north"}
         Frame of the angles.
     height : Height or None
-        What is known of the height of all tags.
+        Known height of all tags.
     confidence : float or None
-        Probability with which the accuracies of positions are to hold; None for 0.68.
+        Probability that the stated accuracies hold; None for 0.68.
     track : bool
         Whether tags are followed from packet to packet.
     hub : HubSettings or None
-        Omlox hub that all positions are sent to as well.
+        Omlox hub that all positions are also sent to.
     payload_bytes : int
         Longest message that is read.
     """
@@ -103,12 +103,12 @@ def parse_broker(text: str, *, tls: bool = False, username: str | None = None, p
     except ValueError:
         host, port = None, None
     if not host or parts.path or parts.query or parts.fragment or "@" in text:
-        raise BrokerError(f"broker {text!r} is no address; give HOST or HOST:PORT, e.g. localhost:1883")
+        raise BrokerError(f"broker {text!r} is not an address; give HOST or HOST:PORT, e.g. localhost:1883")
     return Broker(host=host, port=port or (8883 if tls else 1883), username=username, password=password, tls=tls)
 
 
 def check_settings(settings: MqttSettings) -> None:
-    """Check what a broker would refuse or what would loop.
+    """Refuse topics that a broker does not accept, and topics by which positions would be read as angles.
 
     Raises
     ------
@@ -129,13 +129,13 @@ def check_settings(settings: MqttSettings) -> None:
     try:
         loops = aiomqtt.Topic(topic).matches(settings.topic)
     except ValueError:
-        raise BrokerError(f"topic {settings.topic!r} is no topic filter; give e.g. silabs/aoa/angle/+/+") from None
+        raise BrokerError(f"topic {settings.topic!r} is not a topic filter; give e.g. silabs/aoa/angle/+/+") from None
     if loops:
         raise BrokerError(f"topic {settings.publish!r} is among those read, {settings.topic!r}; give another")
 
 
 def topic_for(publish: str, target_id: str) -> str:
-    """Write the topic of a target's positions; its name is one level of it, whatever it holds.
+    """Write the topic of a target's positions; the escaped name is one level of the topic.
 
     Raises
     ------
@@ -163,7 +163,7 @@ async def run_mqtt(
     broker : Broker
     settings : MqttSettings
     on_ready : callable, optional
-        Called each time that the topics are subscribed to.
+        Called after each subscription.
 
     Raises
     ------
@@ -190,7 +190,7 @@ async def run_mqtt(
 
 
 async def _run_session(session: "_Session", broker: Broker, on_ready: Callable[[], None] | None) -> None:
-    """Connect, and again when the connection breaks."""
+    """Connect, and reconnect when the connection is lost."""
     address, topic = f"{broker.host}:{broker.port}", session.settings.topic
     connected, pause = False, 1.0
     while True:
@@ -223,7 +223,7 @@ def _client(broker: Broker) -> aiomqtt.Client:
 
 
 async def _first_of(*coroutines: Coroutine[Any, Any, None]) -> None:
-    """Run coroutines until the first ends, as a rule with an exception, and cancel the others."""
+    """Run coroutines until the first one ends, normally with an exception, and cancel the others."""
     tasks = [asyncio.create_task(coroutine) for coroutine in coroutines]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -237,7 +237,7 @@ async def _first_of(*coroutines: Coroutine[Any, Any, None]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Session:
-    """Locates packets: the table, and the state from one packet to the next."""
+    """Locates packets; holds the table and the state between packets."""
 
     locator: Locator
     settings: MqttSettings
@@ -247,14 +247,14 @@ class _Session:
     failed: Counter[str] = field(default_factory=Counter)
 
     def summary(self) -> str:
-        """Count what gave no position, in words."""
+        """Describe how many messages and packets gave no position."""
         return (
             f"{self.stream.num_passed_over} messages passed over, {self.stream.num_repeated} delivered twice; "
             f"{self.failed['no position']} packets without a position, {self.failed['defect']} that failed"
         )
 
     async def read(self, client: aiomqtt.Client) -> None:
-        """Take all messages; one that cannot be read is skipped."""
+        """Process all messages; a message that cannot be read is skipped."""
         async for message in client.messages:
             if isinstance(message.payload, bytes):
                 await self._publish(client, self._receive(message.topic.value, message.payload))
@@ -268,7 +268,7 @@ class _Session:
             return []
 
     async def watch(self, client: aiomqtt.Client) -> None:
-        """Complete packets that not all locators have received."""
+        """Locate packets whose window has passed, though some locators have not received them."""
         while True:
             await asyncio.sleep(0.1 * self.settings.window)
             await self._publish(client, self.stream.due(monotonic()))

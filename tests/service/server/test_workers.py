@@ -217,4 +217,4 @@ def test_workers_share_the_rate_of_a_key_and_say_that_they_do_not_share_tracks(h
                 )
             silent.resume()
         assert statuses == [[200] * 4, [200, 429, 429, 429]]
-        server.wait_for("each of the 2 workers follows targets by itself")
+        server.wait_for("each of the 2 workers tracks targets separately")
