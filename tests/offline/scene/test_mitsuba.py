@@ -173,9 +173,9 @@ def test_the_material_counts_in_the_checksum(folder: Path) -> None:
     [
         ("", "holds no triangles"),
         ("<shape type='ply' id='a'/>", "shape 'a' names no file"),
-        (shape(file="meshes/none.ply"), "shape 'box' needs meshes/none.ply, which is not there; put it beside"),
-        (shape(file="x" * 5000), "which is not there"),
-        (shape(file="meshes"), "which is not there"),
+        (shape(file="meshes/none.ply"), "shape 'box' needs meshes/none.ply, which is missing; put it next to"),
+        (shape(file="x" * 5000), "which is missing"),
+        (shape(file="meshes"), "which is missing"),
         (shape(kind="sphere", file=""), "shape 'box' is of type 'sphere', which is not supported; export it as ply"),
         (shape(kind="instance", file=""), "is of type 'instance'"),
         (shape('<ref id="gold"/>'), "refers to the material 'gold', which the file does not define"),
