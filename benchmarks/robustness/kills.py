@@ -1,11 +1,12 @@
-"""Kills of workers and of their service under load, and bad files among its tables.
+"""Kills workers and their service under load, and puts invalid files among its tables.
 
     python -m benchmarks.robustness.kills [--table hall.h5] [--workers 200] [--parents 20] [--bad-files 50]
 
-In random order, workers of a service with two of them are killed, one or all at once, now and then their successors
-right away; the first process is killed and started again; bad files are put beside the good table, and some in its
-place for a moment. Each time the good table must answer again within `--limit` seconds, with two workers, and no
-answer may be 5xx but 503. A new service removes the folders of those that were killed, and the last one leaves none.
+In random order: workers of a service with two workers are killed, one or both at once, sometimes followed at once by
+their successors; the parent process is killed and started again; invalid files are put next to the valid table, and
+some replace it for a short time. Each time the valid table must answer again within `--limit` seconds, with two
+workers, and no answer may be 5xx except 503. A new service removes the folders of those that were killed, and the last
+one leaves none.
 """
 
 import http.client

@@ -3,12 +3,12 @@
     python -m benchmarks.robustness.reports [--table hall.h5] [--valid 100000] [--malformed 100000] [--slow-share 0.1]
 
 Every position must lie in the free space, be finite, and have a positive definite covariance; the candidates'
-probabilities add up to the confidence that the answer states, and to one at most; no
-answer is 5xx but 504 for a fix that reached its time limit; the memory after all is at most `--growth` MiB above that
-after the first half, and no file descriptor is left open. Of the valid reports, `--slow-share` are of all kinds,
-nine of ten of which are slow by their estimate and are located in threads; the others are drawn until the estimate
-calls them quick. The service runs with MALLOC_MMAP_THRESHOLD_=131072, so that what the C library keeps of freed memory
-is not taken for a leak. Request n depends on the seed and n alone: `--only n` sends that one and prints the answer.
+probabilities add up to the confidence that the answer states, and to one at most; no answer is 5xx except 504 for a fix
+that reached its time limit; the memory at the end is at most `--growth` MiB above that after the first half, and no
+file descriptor is left open. A fraction `--slow-share` of the valid reports is of all kinds, of which nine in ten are
+estimated as slow and are located in threads; the others are drawn until they are estimated as quick. The service runs
+with MALLOC_MMAP_THRESHOLD_=131072, otherwise freed memory that the C library keeps would look like a leak. Request n
+depends only on the seed and n: `--only n` sends that one and prints the answer.
 """
 
 import http.client
