@@ -42,7 +42,7 @@ def test_two_tables_are_compared(
     assert first.startswith("ab.h5: ")
     assert second.startswith("abc.h5: ")
     assert float(change.split()[1]) > 5.0  # a station more
-    assert "places of abc.h5" in err
+    assert "positions of abc.h5" in err
     assert "change of the error" in picture.read_text(encoding="utf-8")
 
 

@@ -185,7 +185,7 @@ def test_the_material_counts_in_the_checksum(folder: Path) -> None:
         (moved('<scale value="$missing"/>'), "the value '$missing'"),
         (moved('<translate x="nan"/>'), "the value 'nan'; give 1 finite numbers"),
         (moved('<rotate z="1"/>'), "the value ''; give 1 finite numbers"),
-        (moved('<rotate angle="3"/>'), "rotated about no axis"),
+        (moved('<rotate angle="3"/>'), "has a rotation without an axis"),
         (moved('<matrix value="1 2 3"/>'), "give 9 or 16 finite numbers"),
         (moved('<matrix value="1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 1"/>'), "perspective"),
         (moved('<scale value="0"/>'), "only triangles without an area"),
