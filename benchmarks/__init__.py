@@ -1,1 +1,1 @@
-"""What the figures in docs/ come from. Run a benchmark in a checkout: ``python -m benchmarks.fusion.accuracy``."""
+"""Measurements behind the results in docs/. Run a benchmark in a checkout: ``python -m benchmarks.fusion.accuracy``."""

@@ -4,8 +4,8 @@
 >>> table = rayfix.build("site.toml")                # or rayfix.Table.open("site.h5")
 >>> fix = rayfix.Locator(table).locate(report)       # a rayfix.Report or a dict of the HTTP interface's JSON
 
-The public API is what ``__all__`` of this package and of :mod:`rayfix.client` names; everything else, in the packages
-``rayfix_*`` too, may change without notice. It consists of
+The public API consists of the names in ``__all__`` of this package and of :mod:`rayfix.client`. Everything else,
+including the packages ``rayfix_*``, may change without notice. The names are
 
 - the table: ``build``, ``Table``;
 - a report and its parts: ``Report``, ``Angle``, ``Range``, ``LogRange``, ``TimeOfArrival``, ``TimeDifference``
@@ -17,8 +17,8 @@ The public API is what ``__all__`` of this package and of :mod:`rayfix.client` n
 - a service over the network: ``Client``, ``AsyncClient``, ``RetryPolicy``;
 - the errors, drawn as a tree in :mod:`rayfix.errors`.
 
-Building needs the extra ``rayfix[offline]``, the fusion ``rayfix[service]``, asking a service ``rayfix[client]``.
-Tables, reports and errors need none.
+Builds need the extra ``rayfix[offline]``, the fusion ``rayfix[service]``, and the clients ``rayfix[client]``. Tables,
+reports and errors need no extra.
 """
 
 from importlib import import_module
@@ -199,14 +199,14 @@ _LAZY = {
     ("rayfix.api", "offline"): ("build",),
     ("rayfix.client", "client"): ("AsyncClient", "Client", "RetryPolicy"),
 }
-"""Names by their module and the extra that it needs; a module is imported when a name of it is first used."""
+"""Names by module and the extra that the module needs; a module is imported when one of its names is first used."""
 
 _HOMES = {name: home for home, names in _LAZY.items() for name in names}
 
-if not TYPE_CHECKING:  # to type checkers, a name that is not imported above does not exist
+if not TYPE_CHECKING:  # for type checkers, names that are not imported above must not exist
 
     def __getattr__(name: str) -> Any:
-        """Import what needs an extra when it is first asked for."""
+        """Import a name that needs an extra when it is first used."""
         if name not in _HOMES:
             raise AttributeError(f"module 'rayfix' has no attribute '{name}'")
         module, extra = _HOMES[name]

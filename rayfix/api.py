@@ -21,14 +21,14 @@ def build(
     site_path : str or Path
         Site file.
     table_path : str or Path, optional
-        Where the table goes; beside the site file, with the suffix ``.h5``, when left out.
+        Path of the new table; by default next to the site file, with the suffix ``.h5``.
     jobs : int
         Cells that are fitted at a time; -1 for one per core.
     former : str or Path, optional
-        Table from which whatever still holds is taken; one at ``table_path`` when left out.
+        Table whose valid parts are reused; by default the one at ``table_path``, if there is one.
     tolerance : float
         Fraction of a cell's mass, 0 or more and below 1, that may have changed before a cell of the former table is
-        fitted again. With 0, the table is that of a whole build.
+        fitted again. With 0, the table equals that of a new build.
 
     Raises
     ------

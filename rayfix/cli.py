@@ -1,4 +1,4 @@
-"""The command line. Every error that rayfix foresees is one line on standard error and exit status 2."""
+"""The command line. Every RayfixError is one line on standard error and exit status 2."""
 
 import argparse
 import sys

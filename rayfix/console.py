@@ -1,4 +1,4 @@
-"""What the command line shows: summaries, tables and fixes."""
+"""Output of the command line: summaries, tables and fixes."""
 
 import textwrap
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def print_evaluation(results: Mapping[str, Any], page: Path) -> None:
-    """Print the main figures of an evaluation and where its report is."""
+    """Print the main results of an evaluation and the path of its report."""
     grid = Grid(title=f"{results['site']}: error of the position, m", title_justify="left", box=box.SIMPLE_HEAD)
     grid.add_column("measured")
     for heading in ("rayfix 50 %", "90 %", "paper 50 %", "90 %", "bound 50 %", "90 %"):
@@ -38,7 +38,7 @@ def print_evaluation(results: Mapping[str, Any], page: Path) -> None:
 
 
 def print_check(check: "Check") -> None:
-    """Print a line for each finding, one for the rays that leave the scene, and a summary; wrapped on a terminal."""
+    """Print a line for each finding, one for the lost rays, and a summary; wrapped on a terminal."""
     lines = [f"{finding.severity}: {finding.message}" for finding in check.findings]
     twin = check.twin
     if check.escapes:
@@ -60,7 +60,7 @@ def print_check(check: "Check") -> None:
 
 
 def print_build_summary(summary: "BuildSummary") -> None:
-    """Print a line per station and one for the whole."""
+    """Print a line per station and one for the table."""
     grid = Grid(
         "station",
         title=f"Table {summary.path}",
@@ -87,7 +87,7 @@ def print_build_summary(summary: "BuildSummary") -> None:
         )
     grid.caption = (
         "filled: cells with rays; tubes: components of their mixtures; lost: rays that left the scene; "
-        "<= k: fraction of the free space that is reached with at most k reflections"
+        "<= k: fraction of the free space that paths with at most k reflections reach"
     )
     console = Console()
     console.print(grid)
@@ -104,7 +104,7 @@ def print_build_summary(summary: "BuildSummary") -> None:
 
 
 def _kept(num_kept: int, num_cells: int, largest_change: float) -> str:
-    """Say how many cells were not fitted to this scene, and how far they may be from it."""
+    """Describe how many cells were kept from the former table, and by how much they may differ."""
     share = f"{num_kept:,} of {num_cells:,} finest cells kept"
     return f"{share}, changed by at most {largest_change:.2%}" if largest_change else f"{share}, all of them exact"
 
@@ -143,7 +143,7 @@ def table_info(table: Table) -> dict[str, Any]:
 
 
 def _update_info(update: Update | None) -> dict[str, Any] | None:
-    """Say how far a station may be from a whole build; None when it is what a whole build makes."""
+    """Describe how far a station may differ from a new build; None if it is equal."""
     if update is None:
         return None
     return {
@@ -168,7 +168,7 @@ def print_table_info(table: Table) -> None:
         console.print(line, highlight=False, soft_wrap=True)
     if any(facts["origin_m"]):
         origin = ", ".join(f"{v:.0f}" for v in facts["origin_m"])
-        console.print(f"the table's own coordinates count from ({origin}) m", highlight=False, soft_wrap=True)
+        console.print(f"positions in the table are relative to ({origin}) m", highlight=False, soft_wrap=True)
     grid = Grid("station", "position, m", box=box.SIMPLE_HEAD)
     for heading in ("window, deg", "cells", "components"):
         grid.add_column(heading, justify="right")
@@ -187,7 +187,7 @@ def print_table_info(table: Table) -> None:
             cells = sum(level["cells"] for level in station["levels"])
             update = station["update"]
             console.print(
-                f"{station['id']}: {update['changed_cells']:,} of {cells:,} cells differ from those of a whole build, "
+                f"{station['id']}: {update['changed_cells']:,} of {cells:,} cells differ from those of a new build, "
                 f"by at most {update['largest_change']:.2%} (tolerance {update['tolerance']:.2%}); build without "
                 "--tolerance to make it exact",
                 highlight=False,
@@ -200,7 +200,7 @@ def print_fix(document: Mapping[str, Any]) -> None:
     if document["position"] is None:
         print(f"{document['status']}: no measurement could be used")
     elif document["status"] == "inconsistent":
-        # Probabilities hold for measurements that the model is of, which these are not.
+        # The probabilities assume that the model fits the measurements, which it does not here.
         print(f"inconsistent: {place(document['position'])} is only the best guess")
     else:
         print(f"{document['status']}: {place(document['position'])}")
@@ -221,10 +221,10 @@ def print_fix(document: Mapping[str, Any]) -> None:
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number with its noun."""
+    """Return a number and its noun, in the plural unless it is one."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def place(position: Mapping[str, float]) -> str:
-    """Coordinates as a person reads them."""
+    """Format the coordinates of a position."""
     return f"({position['x']:.2f}, {position['y']:.2f}, {position['z']:.2f}) m"

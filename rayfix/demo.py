@@ -1,4 +1,4 @@
-"""``rayfix demo``: the whole main job on the bundled hall, for real and in a minute or two."""
+"""``rayfix demo``: builds, serves and locates in the bundled hall, in a minute or two."""
 
 import json
 import signal
@@ -25,7 +25,7 @@ from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table
 
 _IDLE_SECONDS = 120.0
-"""A service that for so long has neither worked nor logged anything, and is not ready, hangs."""
+"""A service that is not ready counts as hung after this time without processor use or log output."""
 
 _ANSWER_SECONDS = 600.0
 
@@ -36,7 +36,7 @@ def run_demo(folder: Path, *, jobs: int = -1) -> float:
     Parameters
     ----------
     folder : Path
-        Where everything goes.
+        Folder of all output files.
 
     Returns
     -------
@@ -56,15 +56,15 @@ def run_demo(folder: Path, *, jobs: int = -1) -> float:
         summary = build_table(site, table_path, jobs=jobs, progress=progress)
     print_build_summary(summary)
 
-    print("\n2. A UE behind machines sends; each station reports the angle (1 deg) and time (0.5 m) of one path.")
+    print("\n2. A UE behind machines transmits; each station reports the angle (1 deg) and time (0.5 m) of one path.")
     paths = example_paths()
     report = json.loads(report_text(simulate_example_report(paths)))
     (folder / REPORT_FILE).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     for station_id, found in paths.items():
         bounces = int(found.num_reflections[0])
-        print(f"   {station_id} hears it " + ("directly" if bounces == 0 else f"by {counted(bounces, 'reflection')}"))
+        print(f"   {station_id}: " + ("direct path" if bounces == 0 else f"path with {counted(bounces, 'reflection')}"))
 
-    print("\n3. The service takes the report.")
+    print("\n3. The service locates the report.")
     with _service(table_path) as url:
         try:
             answer = httpx.post(f"{url}/v1/positions", json=report, timeout=_ANSWER_SECONDS, trust_env=False)
@@ -78,7 +78,7 @@ def run_demo(folder: Path, *, jobs: int = -1) -> float:
     picture = folder / "fix.png"
     rays = {name: found.vertices[0] for name, found in paths.items()}
     plot_fix(picture, Table.open(table_path), document, truth=EXAMPLE_POSITION, rays=rays)
-    print(f"\nThe picture is {picture}. All this took {time.perf_counter() - begin:.0f} s.")
+    print(f"\nThe picture is {picture}. The demo took {time.perf_counter() - begin:.0f} s.")
     print(f"Serve this table yourself: {own_command()} serve {table_path}")
     return error
 
@@ -105,7 +105,7 @@ def _print_outcome(document: dict[str, Any]) -> float:
 
 @contextmanager
 def _service(table_path: Path) -> Iterator[str]:
-    """Serve a table in a process of its own until the block ends."""
+    """Serve a table in a separate process until the block ends."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -134,7 +134,7 @@ def _log_of(table_path: Path) -> Path:
 
 
 def _wait_until_ready(url: str, process: subprocess.Popen[bytes], log: Path) -> None:
-    """Wait as long as the service lives and works, and show what it logs meanwhile."""
+    """Wait for readiness as long as the service runs and makes progress, and show its log messages."""
     shown = 0
     trace, since = _trace(process.pid, log), time.monotonic()
     while process.poll() is None:
@@ -149,20 +149,20 @@ def _wait_until_ready(url: str, process: subprocess.Popen[bytes], log: Path) -> 
             trace, since = now, time.monotonic()
         elif time.monotonic() - since > _IDLE_SECONDS:
             raise RayfixError(f"the service has done nothing for {_IDLE_SECONDS:.0f} s; its log is {log}")
-    raise RayfixError(f"the service ended with status {process.returncode}; its log {log} says why{_last_line(log)}")
+    raise RayfixError(f"the service ended with status {process.returncode}; see its log {log}{_last_line(log)}")
 
 
 def _trace(pid: int, log: Path) -> tuple[str, int]:
-    """Return what grows while a process works: its processor time and its log."""
+    """Return two measures of progress: the process's processor time and the size of its log."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
-    except OSError:  # ended just now
+    except OSError:  # the process has just ended
         fields = []
     return " ".join(fields[11:15]), log.stat().st_size
 
 
 def _show_kernels(log: Path, shown: int) -> int:
-    """Print the whole lines on kernels that were logged after a position; returns the position after them."""
+    """Print the complete lines about kernels after a position in the log; returns the position after them."""
     with log.open("rb") as file:
         file.seek(shown)
         new = file.read()

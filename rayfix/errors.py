@@ -27,8 +27,8 @@
     ├── HubError                    the address of an omlox hub
     └── ViewError                   ``rayfix view``: the page cannot be written
 
-Anything else that escapes is a defect of rayfix. All of these but two are in the package ``rayfix``: malformed and
-invalid reports are caught as :class:`ReportError`.
+Anything else that escapes is a defect of rayfix. All but two are exported by ``rayfix``: catch malformed and invalid
+reports as :class:`ReportError`.
 """
 
 from dataclasses import dataclass
@@ -69,7 +69,7 @@ __all__ = [
 
 
 class MissingExtraError(RayfixError, ImportError):
-    """A part of rayfix is used whose dependencies are not installed."""
+    """The dependencies of a part of rayfix are not installed."""
 
 
 class ViewError(RayfixError):
@@ -77,7 +77,7 @@ class ViewError(RayfixError):
 
 
 class ClientError(RayfixError):
-    """Something went wrong between the client and the service."""
+    """Base of the errors between the client and the service."""
 
 
 class UnreachableError(ClientError):
@@ -85,7 +85,7 @@ class UnreachableError(ClientError):
 
 
 class AnswerError(ClientError):
-    """The answer is not one of this service: the address is another's, or a proxy's answered."""
+    """The answer is not from a rayfix service: the address is wrong, or a proxy answered."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ class ProblemError(ClientError):
     Parameters
     ----------
     detail : str
-        What is wrong this time, and what to do about it.
+        The problem in this case and its remedy.
     kind : str
         URI of the kind of problem.
     status : int
@@ -127,7 +127,7 @@ class ProblemError(ClientError):
 class RefusedReportError(ProblemError, ReportError):
     """A report that the service cannot use.
 
-    ``path`` has one element, the first offending field as the service writes it; ``errors`` has all.
+    ``path`` has one element: the first offending field, as the service writes it. ``errors`` has all fields.
     """
 
     def __init__(self, detail: str, *, kind: str, status: int, errors: tuple[ProblemField, ...] = ()) -> None:

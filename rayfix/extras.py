@@ -1,4 +1,4 @@
-"""One clear message where an optional dependency is missing."""
+"""One clear message for a missing optional dependency."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ from rayfix.errors import MissingExtraError
 
 @contextmanager
 def needs_extra(extra: str) -> Iterator[None]:
-    """Say which extra to install when an import within fails.
+    """Raise an error that names the extra to install, if an import in the context fails.
 
     Raises
     ------

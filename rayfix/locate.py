@@ -25,7 +25,7 @@ def locate_file(
     confidence: float | None = None,
     errors: AngleErrors | None = None,
 ) -> list[dict[str, Any]]:
-    """Answer a file as the HTTP interface does: with one position, or with one for each epoch of u-blox lines.
+    """Locate a file's report and return the HTTP interface's JSON; for u-blox lines, one answer per transmission.
 
     Parameters
     ----------
@@ -33,13 +33,13 @@ def locate_file(
     input_format, output_format : str
         Formats of docs/formats.md.
     stations : Mapping, optional
-        Stations by the names that the file has for them; a native report has the table's own.
+        Stations by their names in the file; a native report uses the stations' identifiers.
     height : Height, optional
         Prior of the target's height, for reports without one.
     confidence : float, optional
-        Probability with which accuracies are to hold, instead of the report's.
+        Probability that the stated accuracies hold, instead of the report's.
     errors : AngleErrors, optional
-        Of the angles of u-blox lines, which state none.
+        Errors of the angles of u-blox lines, which do not state them.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def locate_file(
         raise ReportError("a native report names the stations of the table; --station is for other systems' messages")
     if errors is not None and input_format != "ublox":
         raise ReportError(
-            f"{input_format} reports state the deviations of their angles; --stdev and --tails are for u-blox lines"
+            f"{input_format} reports state the errors of their angles; --stdev and --tails are for u-blox lines"
         )
     try:
         body = report_path.read_bytes()

@@ -1,4 +1,4 @@
-"""Locate from an MQTT broker until told to end."""
+"""Locate from an MQTT broker until a signal."""
 
 import asyncio
 import logging
@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 
 @logged_to_stderr()
 def serve_mqtt(table_path: Path, broker: Broker, settings: MqttSettings) -> None:
-    """Locate from a broker until the process is told to end (SIGINT, SIGTERM).
+    """Locate from a broker until the process receives SIGINT or SIGTERM.
 
     Raises
     ------
@@ -34,10 +34,10 @@ def serve_mqtt(table_path: Path, broker: Broker, settings: MqttSettings) -> None
     _log.info("loading %s", table_path)
     locator = Locator(table)
     locator.warm_up()
-    asyncio.run(_until_told(locator, broker, settings))
+    asyncio.run(_until_signalled(locator, broker, settings))
 
 
-async def _until_told(locator: Locator, broker: Broker, settings: MqttSettings) -> None:
+async def _until_signalled(locator: Locator, broker: Broker, settings: MqttSettings) -> None:
     loop = asyncio.get_running_loop()
     work = asyncio.ensure_future(run_mqtt(locator, broker, settings))
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -45,4 +45,4 @@ async def _until_told(locator: Locator, broker: Broker, settings: MqttSettings) 
     try:
         await work
     except asyncio.CancelledError:
-        _log.info("told to end")
+        _log.info("ending after a signal")

@@ -1,4 +1,4 @@
-"""How the user can run rayfix again: by its name only where the shell finds it."""
+"""The command line by which the user can run this rayfix again."""
 
 import os
 import shlex
@@ -10,7 +10,7 @@ from pathlib import Path
 def own_command() -> str:
     """Return the beginning of a command line that runs this rayfix.
 
-    ``rayfix`` where that is what the shell finds, else the path of the program that runs, else ``python -m rayfix``.
+    It is ``rayfix`` if the shell finds this program by that name, else the path of the program or ``python -m rayfix``.
     """
     program = Path(sys.argv[0])
     if program.name != "rayfix" or not program.is_file():
@@ -22,7 +22,7 @@ def own_command() -> str:
 
 
 def _shortest(path: Path) -> str:
-    """Path relative to the current folder if it lies below that. Links stay: an environment's Python is one."""
+    """Path relative to the current folder if it lies in it. Links are kept, because an environment's Python is one."""
     absolute = Path(os.path.abspath(path))
     try:
         return str(absolute.relative_to(os.getcwd()))

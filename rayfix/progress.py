@@ -1,4 +1,4 @@
-"""Progress on standard error: bars on a terminal, elsewhere a line from time to time."""
+"""Progress on standard error: bars on a terminal, otherwise a line every few seconds."""
 
 import resource
 import sys
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from rayfix_offline.build import Progress as BuildProgress
 
 _LINE_SECONDS = 10.0
-"""Time between two lines where there is no terminal."""
+"""Time between two lines without a terminal."""
 
 _TABLE_STAGES = ("reading the scene", "balancing", "writing")
-"""Of a build, besides those of stations and levels."""
+"""Stages of a build in addition to those of stations and levels."""
 
 Show = Callable[[str, int, int], None]
 
 
 @contextmanager
 def build_progress(*, enabled: bool) -> "Iterator[BuildProgress | None]":
-    """Show stage, rate, time that is left and memory on standard error."""
+    """Show stage, rate, remaining time and memory on standard error."""
     if not enabled:
         yield None
         return
@@ -55,7 +55,7 @@ def _build_bar() -> Iterator[Show]:
             bar.update(known, visible=False)
             return
         if total != bar.tasks[1].total:
-            bar.reset(known)  # another stage's rate tells nothing of this one's
+            bar.reset(known)  # rates of different stages are not comparable
         bar.update(known, description=stage, completed=done, total=total, visible=True)
         bar.update(unknown, visible=False)
 
@@ -65,7 +65,7 @@ def _build_bar() -> Iterator[Show]:
 
 @contextmanager
 def evaluation_progress(*, enabled: bool) -> Iterator[Show]:
-    """Show each stage of an evaluation and the time that is left of it on standard error."""
+    """Show each stage of an evaluation and its remaining time on standard error."""
     if not enabled:
         yield lambda stage, done, total: None
         return
@@ -87,7 +87,7 @@ def _evaluation_bars() -> Iterator[Show]:
 
     def show(stage: str, done: int, total: int) -> None:
         nonlocal current
-        # Stages of a table being built come by station and level; one bar stands for them.
+        # A build reports stages by station and level; one bar shows them all.
         name = "building tables" if ":" in stage or stage in _TABLE_STAGES else stage
         bar.start()
         if name not in tasks:
@@ -104,9 +104,9 @@ def _evaluation_bars() -> Iterator[Show]:
 
 @contextmanager
 def _stopped(bar: Progress, known: TaskID | None) -> Iterator[None]:
-    """Stop a bar in the end; one that was never shown would leave an empty line.
+    """Stop a bar at the end; stopping one that was never shown would print an empty line.
 
-    A failure before the amount of work is known, as of a mistake in the scene, leaves its message only.
+    After a failure before the amount of work is known, such as a mistake in the scene, only the message is shown.
     """
     try:
         yield
@@ -122,7 +122,7 @@ def _stopped(bar: Progress, known: TaskID | None) -> Iterator[None]:
 
 @contextmanager
 def _lines() -> Iterator[Show]:
-    """Write a line on the stage that is under way from time to time, also while nothing is reported."""
+    """Write a line on the current stage at regular intervals, even without new reports."""
     begin, ended = time.monotonic(), threading.Event()
     latest = ("starting", 0, 0)
 
@@ -146,7 +146,7 @@ def _lines() -> Iterator[Show]:
 
 
 class _RateColumn(ProgressColumn):
-    """Cells that are done in a second."""
+    """Cells per second."""
 
     def render(self, task: Task) -> Text:
         cells = ":" in task.description
@@ -154,7 +154,7 @@ class _RateColumn(ProgressColumn):
 
 
 class _TimesColumn(ProgressColumn):
-    """Time since the beginning, which goes on until the end, and what is left of the stage."""
+    """Elapsed time of the whole job, and remaining time of the stage."""
 
     def render(self, task: Task) -> Text:
         ended: float | None = task.fields["ended"]
@@ -169,7 +169,7 @@ def _clock(seconds: float) -> str:
 
 
 class _MemoryColumn(ProgressColumn):
-    """Most memory that the process has held."""
+    """Peak memory of the process."""
 
     def render(self, task: Task) -> Text:
         return Text(f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9:.1f} GB")

@@ -1,4 +1,4 @@
-"""``rayfix view``: the viewer with a site and its fixes in one file, which needs no service."""
+"""``rayfix view``: the viewer with a site and its fixes in one HTML file that works without a service."""
 
 import base64
 import hashlib
@@ -33,7 +33,7 @@ def write_view(table_path: Path, output: Path, report_path: Path | None = None) 
     output : pathlib.Path
         The page, HTML.
     report_path : pathlib.Path, optional
-        A report as ``POST /v1/positions`` takes it, or several in ``{"reports": [...]}``.
+        A report in the form of ``POST /v1/positions``, or several in ``{"reports": [...]}``.
 
     Returns
     -------
@@ -50,11 +50,11 @@ def write_view(table_path: Path, output: Path, report_path: Path | None = None) 
         When the viewer is not built, or the page cannot be written.
     """
     if output.suffix.lower() not in _PAGES:
-        raise ViewError(f"{output} is not the name of a page; end it in {_PAGES[0]}")
+        raise ViewError(f"{output} is not a valid name of a page; end it in {_PAGES[0]}")
     table = open_checked(table_path)
     locator = Locator(table)
     if report_path is not None:
-        locator.warm_up()  # else compute_ms of the first fix would include compilation
+        locator.warm_up()  # otherwise compute_ms of the first fix would include compilation
     events = [] if report_path is None else [_event(locator, document) for document in read_reports(report_path)]
     page = render_view(table_path.stem, table, events)
     try:
@@ -70,7 +70,7 @@ def read_reports(path: Path) -> list[Mapping[str, Any]]:
     Raises
     ------
     ReportError
-        When there is none; the message names the file.
+        When the file has no report; the message names the file.
     """
     try:
         document = read_json(path.read_bytes())
@@ -80,12 +80,12 @@ def read_reports(path: Path) -> list[Mapping[str, Any]]:
         raise ReportError(f"{path}: {error}", path=error.path) from error
     documents = document["reports"] if isinstance(document, dict) and "reports" in document else [document]
     if not isinstance(documents, list) or not all(isinstance(one, dict) for one in documents):
-        raise ReportError(f'{path} is no report; give {{"measurements": [...]}} or {{"reports": [...]}}')
+        raise ReportError(f'{path} is not a report; give {{"measurements": [...]}} or {{"reports": [...]}}')
     return documents
 
 
 def render_view(name: str, table: Table, events: list[dict[str, Any]]) -> str:
-    """Write the page as text.
+    """Return the page as text.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def render_view(name: str, table: Table, events: list[dict[str, Any]]) -> str:
         Of the table.
     table : Table
     events : list of dict
-        Reports with their fixes, as the viewer takes them.
+        Reports with their fixes, in the form of the viewer's events.
 
     Raises
     ------
@@ -114,11 +114,11 @@ def render_view(name: str, table: Table, events: list[dict[str, Any]]) -> str:
 
 
 def inline(static: Path, data: Mapping[str, Any], *, title: str) -> str:
-    """Put the built viewer and data into one page, whose policy allows its own script and style and nothing else."""
+    """Combine the built viewer and data into one page, with a Content-Security-Policy for only its script and style."""
     if not viewer_is_built(static):
         raise ViewError(
-            "this installation is without the viewer, as there was no Node.js 20.19 or later when it was made; install "
-            "rayfix again with that, or run 'make viewer' in a checkout; 'rayfix plot' draws a fix without it"
+            "this installation has no viewer, because there was no Node.js 20.19 or later when it was made; install "
+            "Node.js and rayfix again, or run 'make viewer' in a checkout; 'rayfix plot' draws a fix without it"
         )
     page = (static / INDEX).read_text(encoding="utf-8")
     script = _only(static, "*.js").replace("</script", "<\\/script").replace("<!--", "<\\!--")
@@ -131,7 +131,7 @@ def inline(static: Path, data: Mapping[str, Any], *, title: str) -> str:
         f'<meta http-equiv="Content-Security-Policy" content="{html.escape(policy)}">'
         f"<title>{html.escape(title)}</title><style>{style}</style>"
     )
-    # Within a script element no "<" may begin a tag.
+    # "<" must not begin a tag within a script element.
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     body = f'<script type="application/json" id="rayfix-data">{text}</script><script type="module">{script}</script>'
     page = re.sub(r"\s*<script\b[^>]*></script>|\s*<link rel=\"stylesheet\"[^>]*>|\s*<title>.*?</title>", "", page)
@@ -140,7 +140,7 @@ def inline(static: Path, data: Mapping[str, Any], *, title: str) -> str:
 
 
 def _licences(static: Path) -> str:
-    """Licences of what is bundled, which must go with it, as a comment."""
+    """Licences of the bundled code, which must accompany it, as an HTML comment."""
     path = static / "third-party-licences.md"
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
     return f"<!--\n{text.replace('--', '- -')}-->"

@@ -1,1 +1,1 @@
-"""What several benchmarks use."""
+"""Code of several benchmarks."""

@@ -1,4 +1,4 @@
-"""A search for reports that take long: random valid ones of all kinds, changed step by step towards cost."""
+"""A search for reports that take long: random valid reports of all kinds, changed step by step to increase the cost."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence

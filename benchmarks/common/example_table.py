@@ -1,4 +1,4 @@
-"""The table that a benchmark runs on: one from the command line, or the bundled hall's, built for it."""
+"""The table of a benchmark: one from the command line, or the bundled hall's, which is built first."""
 
 import argparse
 import tempfile

@@ -1,4 +1,4 @@
-"""Log-likelihood of points that a fit has not seen, and what else the studies of fits have in common."""
+"""Held-out log-likelihood of fits, and other common parts of the fit studies."""
 
 import time
 from collections.abc import Callable

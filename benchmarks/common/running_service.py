@@ -1,4 +1,4 @@
-"""A service in a process of its own, which a benchmark loads, watches and kills."""
+"""A service in a separate process that a benchmark loads, monitors and kills."""
 
 import re
 import signal

@@ -1,4 +1,4 @@
-"""What every answer with a position must fulfil, whatever the report says."""
+"""Checks that every answer with a position must pass, whatever the report."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""Targets that walk through a building, and how well they are followed: errors with and without tracking."""
+"""Simulated targets that walk through a building, and their position errors with and without tracking."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The warehouse of the studies: a real scene that lies beside the repository, and six stations in it."""
+"""The warehouse of the studies: a real scene outside of the repository, with six stations."""
 
 from pathlib import Path
 

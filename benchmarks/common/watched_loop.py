@@ -1,4 +1,4 @@
-"""A service whose event loop says how long each of its callbacks took, in memory that another process reads.
+"""A service with an event loop that writes the duration of each callback to memory that another process reads.
 
 As a program it takes a table and a file of at least 32 bytes, and serves the table with one worker. The loop is
 asyncio's own: that of uvloop, which the service has otherwise, calls the same callbacks and has no place to measure

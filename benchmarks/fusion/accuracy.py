@@ -1,4 +1,4 @@
-"""Accuracy in the bundled hall: 300 uniform drops, the strongest path to each station, beside the error bound.
+"""Accuracy in the bundled hall: 300 uniform drops, the strongest path to each station, compared with the error bound.
 
 Run with ``make accuracy``, or with ``--table`` on any table.
 """

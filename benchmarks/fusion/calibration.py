@@ -1,7 +1,7 @@
-"""Is the stated uncertainty right? Credible ellipsoids, gross failures and rivals over uniform drops.
+"""Calibration of the stated uncertainty: credible ellipsoids, gross failures and rivals over uniform drops.
 
-The reported figures are those of the default seed. Settings of the fusion must not be chosen by it: use another
-(``--seed 1``, say) for that, so that what is reported is a test.
+The published results have the default seed. Use another seed (such as ``--seed 1``) to choose settings of the fusion;
+otherwise the published results would not be a test.
 """
 
 from collections import Counter

@@ -1,8 +1,8 @@
 """The beam against the exhaustive product, on reports of all kinds.
 
-Of each factor the alternatives that are likely near the true place are kept, twelve or so, and the outlier: then all
-products, tens of thousands a report, can be formed, and are, by plain NumPy. The default beam forms and merges what it
-keeps of the same factors. Told is what that changes: the report's evidence, and the posterior's mean and width.
+Each factor is reduced to about twelve alternatives that are likely near the true position, and the outlier. All
+products, tens of thousands per report, are then computed by plain NumPy. The default beam search runs on the same
+factors. Printed are the differences of the report's evidence and of the posterior's mean and width.
 """
 
 import math

@@ -1,10 +1,10 @@
-"""How long a fix takes on one thread, beside the paper's method run online on the same reports.
+"""Time of a fix on one thread, compared with the paper's method run online on the same reports.
 
-Both get the same reports of drops that every station of the table hears, each station its strongest path. The paper's
-method launches its rays, selects, fits and multiplies anew for each report (docs/paper-method.md); it is slow, so it
-gets the first few of them only, and errors are those of these few for both. Times are processor time, which on an idle
-machine is that of the clock. Fixes per second are by the clock, of twenty times all reports in one call, in one and in
-two processes.
+Both locate the same reports of drops that are audible to every station of the table; each station reports its strongest
+path. The paper's method launches its rays, selects, fits and multiplies for each report (docs/paper-method.md). It is
+slow and gets only the first few reports; errors are given for these, for both methods. Times are processor time, which
+on an idle machine equals wall time. Fixes per second are by wall time, for twenty times all reports in one call, in one
+and in two processes.
 """
 
 from collections.abc import Callable

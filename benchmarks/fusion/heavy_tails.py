@@ -1,9 +1,9 @@
-"""What stating heavy-tailed errors buys where errors have heavy tails, what it costs where they have not, and the time.
+"""Benefit of stating heavy-tailed errors when errors have heavy tails, loss when they do not, and computing time.
 
 The same drops, paths and draws each time: errors of angles and ranges are Gaussian, contaminated (one in ten of three
-standard deviations) or Student's with three degrees of freedom, scaled to the same middle half; reports state them as
-Gaussian, as heavy-tailed, or as Gaussian of the whole error's standard deviation. Accuracy in metres, time in
-milliseconds; ``share`` is how much of the truth's error is within the stated 68 % ellipsoid.
+standard deviations) or Student's with three degrees of freedom, scaled to the same interquartile range; reports state
+them as Gaussian, as heavy-tailed, or as Gaussian of the whole error's standard deviation. Accuracy in metres, time in
+milliseconds; ``share`` is the fraction of true positions within the stated 68 % ellipsoid.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,6 @@
-"""Planning maps beside measured errors: a floor forecast from the table, and measured with the forward solver.
+"""Planning maps compared with measured errors: a floor forecast from the table, and simulated with the forward solver.
 
-Run with ``--table`` on any table; the bundled hall's is built when left out.
+Run with ``--table`` on any table; by default the bundled hall's is built.
 """
 
 import numpy as np

@@ -1,11 +1,10 @@
-"""What wrong measurements, wrong deviations and a wrong twin do to fixes.
+"""Effect of wrong measurements, wrong standard deviations and a wrong twin on fixes.
 
-1. One measurement of four is nonsense: how much larger the median error is than of the sound report, beside that of the
-   report without the measurement, and how often it is the one marked as outlier: the only one of its kind (angle or
-   time) above 0.5.
-2. The deviations in the report are half or twice the true ones.
-3. The building is not as its twin says: objects 5 cm off, walls 2 cm, stations turned by 0.5 deg; the truth is
-   simulated in the changed building, the table is that of the nominal one.
+1. One measurement of four is an outlier: ratio of the median error to that of the correct report, with and without the
+measurement, and how often the outlier is identified: as the only measurement of its kind (angle or time) with an
+outlier probability above 0.5. 2. The standard deviations in the report are half or twice the true ones. 3. The building
+differs from its twin: objects by 5 cm, walls by 2 cm, stations rotated by 0.5 deg. Reports are simulated in the changed
+building; the table is that of the nominal one.
 """
 
 from collections import Counter

@@ -1,6 +1,6 @@
-"""What following targets buys: errors of fixes and tracks of the same reports along simulated walks.
+"""Benefit of tracking: errors of fixes and of tracks from the same reports along simulated walks.
 
-The reported figures are those of the default seed. Settings of the tracking must not be chosen by it: use another.
+The published results have the default seed. Use another seed to choose settings of the tracking.
 """
 
 from time import perf_counter

@@ -1,8 +1,8 @@
-"""Real UWB ranges, no angles: accuracy against motion capture, beside least squares (docs/real-data.md).
+"""Real UWB ranges without angles: accuracy against motion capture, compared with least squares (docs/real-data.md).
 
-The twin is an empty room around eight anchors. The first quarter of the run gives each anchor's bias and the deviation
-of the ranges; after a pause of a twentieth, figures are those of the rest. "One wrong" adds 3 m to one range of eight,
-drawn at random, as a blocked path would.
+The twin is an empty room around eight anchors. The first quarter of the run determines each anchor's bias and the
+standard deviation of the ranges. After a gap of a twentieth, the rest is evaluated. "One wrong" adds 3 m to one range
+of eight, drawn at random, as a blocked path would.
 """
 
 import argparse

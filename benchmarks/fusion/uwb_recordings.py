@@ -1,9 +1,9 @@
 """Real ranges: a trolley with three UWB tags among eight anchors, and motion capture as the truth.
 
 Reads the data set "dynamic, fast" of H. Jiang (MIT licence); see docs/real-data.md. Of the motion capture's four
-quaternion columns the second is the real part and the third the turn about z: the data set names another order, by
-which the trolley would lie on its back and ranges would scatter by 0.23 m instead of 0.08 m. The trolley rolls on a
-flat floor, so the turn about z is all that is taken.
+quaternion columns, the second is the real part and the third the rotation about z. The data set states another order,
+with which the trolley would lie on its back and ranges would scatter by 0.23 m instead of 0.08 m. The trolley rolls on
+a flat floor, so only the rotation about z is used.
 """
 
 import csv

@@ -1,8 +1,8 @@
-"""Looks for reports that take long, and tells whether the bounds hold: the estimate, the work, the time limit.
+"""Searches for reports that take long, and checks the bounds: the cost estimate, the work, the time limit.
 
-A seeded search climbs towards processor time over reports of all kinds. Printed are the costliest reports, how often
-the estimate that tells quick reports from slow ones was below the time by which factor, and how long after its limit a
-fix was still under way. Ends with an error where a bound does not hold.
+A seeded search over reports of all kinds maximises processor time. Printed are the costliest reports, how often and by
+which factor the estimate that separates quick from slow reports was below the time, and how long fixes ran beyond their
+limit. Exits with an error if a bound does not hold.
 """
 
 import math

@@ -1,8 +1,8 @@
-"""The builder's speed, as ratios: the ray stage against bare Embree, the fit by tubes against the fit by em.
+"""The builder's speed, as ratios: the ray stage relative to Embree alone, the fit by tubes relative to the fit by em.
 
-What is compared runs on one thread and is given as the median of five runs of processor time; the sums of wide cells
-run once. ``--build`` builds the whole hall as well, on all cores: once with nothing compiled yet, and once more. The
-machine's load is printed with it.
+Both sides run on one thread; results are medians of five runs of processor time. The sums of wide cells run once.
+``--build`` also builds the whole hall on all cores: once with nothing compiled yet, and once again. The machine's load
+is printed too.
 """
 
 import argparse

@@ -1,8 +1,8 @@
-"""Curved surfaces: groups, components, time and held-out log-likelihood as a pillar or a vault gets more facets.
+"""Curved surfaces: groups, components, time and held-out log-likelihood by number of facets of a pillar or a vault.
 
-Each scene is fitted twice, with the facets of a curved surface gathered together, as a build does, and each on its own.
-Cells are those that see the curved surface. Held-out points come from rays of another seed in a scene with so many
-facets that it is round: that is what the building is. docs/scenes.md has the figures.
+Each scene is fitted twice: with the facets of a curved surface grouped, as in a build, and separately. Only cells that
+see the curved surface are used. Held-out points are from rays of another seed in a scene with so many facets that it is
+practically round, like the building. docs/scenes.md has the figures.
 """
 
 import argparse

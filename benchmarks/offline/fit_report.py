@@ -1,4 +1,4 @@
-"""What the study of the fit found: tables, a verdict in words, and pictures."""
+"""Report of the fit study: tables, conclusions, and pictures."""
 
 from pathlib import Path
 from typing import Any

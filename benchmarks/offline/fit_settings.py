@@ -1,4 +1,4 @@
-"""Ways to fit a cell that the study of the fit compares."""
+"""Fit settings that the fit study compares."""
 
 from dataclasses import dataclass
 

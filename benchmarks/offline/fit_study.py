@@ -1,8 +1,8 @@
-"""What the fit's settings buy at the finest window: held-out log-likelihood, time and size, for tubes and for em.
+"""Effect of the fit's settings at the finest window: held-out log-likelihood, time and size, for tubes and for em.
 
-The hall is the bundled one; the warehouse is read from ``../shared/data`` and left out where that is missing. What
-was measured of a site goes to ``results.json``; sites that are in it already stay, so that each can have its own run.
-docs/fit-study.md discusses the results; ``wide_study.py`` judges the wide windows.
+The hall is the bundled one; the warehouse is read from ``../shared/data`` and left out if that is missing. Results of a
+site are added to ``results.json``; other sites in it are kept, which permits one run per site. docs/fit-study.md
+discusses the results; ``wide_study.py`` is for the wide windows.
 """
 
 import argparse

@@ -1,8 +1,8 @@
-"""A million triangles: processor seconds and memory of each stage, from the file to the table.
+"""A million triangles: processor time and memory of each stage, from the file to the table.
 
-The scenes are a hall of 40 x 60 x 8 m with, each to about a million triangles: *clutter*, balls with dents, pillars of
-256 facets and finely cut boxes; *boxes*, 83,000 small ones; *terrain*, a rough floor. Each runs in a process of its
-own, so that the peaks of memory are its own. docs/scenes.md has the figures.
+Each scene is a hall of 40 x 60 x 8 m with about a million triangles: *clutter* has dented balls, pillars of 256 facets
+and finely divided boxes; *boxes* has 83,000 small ones; *terrain* has a rough floor. Each runs in a separate process to
+measure its own peak memory. docs/scenes.md has the figures.
 """
 
 import argparse

@@ -1,8 +1,8 @@
-"""How fine the path prior's voxel map must be: rays and voxels against the image method.
+"""Necessary resolution of the path prior's voxel map: rays and voxels compared with the image method.
 
-At places on a station's rays, drawn uniformly over the volume that the rays sweep, the image method gives the exact
-sum of gain^beta over all paths. Maps of several ray spacings and voxel sizes are judged by the error of the logarithm
-of that sum, and by the share of the rays' weight s^2 pi that they put wrong. Draws docs/path-prior.svg.
+At positions on a station's rays, drawn uniformly from the volume that the rays sweep, the image method gives the exact
+sum of gain^beta over all paths. Maps of several ray spacings and voxel sizes are compared by the error of the logarithm
+of that sum, and by the fraction of the rays' weight s^2 pi that they misplace. Draws docs/path-prior.svg.
 """
 
 import argparse

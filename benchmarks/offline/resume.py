@@ -1,8 +1,8 @@
 """Kill builds of the hall at random moments, resume them, and compare the tables with that of an uninterrupted build.
 
-A build is killed (SIGKILL) after it has saved a shard, at a moment that is uniform over the rest of an uninterrupted
-build, the writing of the table included. The build that resumes it is killed in the same way, until one ends before
-its moment; its table is compared, and the next starts from nothing. Exit status 1 when a table differs.
+A build is killed (SIGKILL) after it has saved a shard, at a time that is uniform over the rest of an uninterrupted
+build, including the writing of the table. The build that resumes it is killed in the same way, until one finishes
+before its time. Its table is compared, and the next build starts from scratch. Exit status 1 when a table differs.
 """
 
 import argparse

@@ -1,6 +1,6 @@
-"""What a large site costs: one station's rays and cells measured, and multiplied.
+"""Cost of a large site, extrapolated from one station's rays and cells.
 
-Give a site file, or let the bundled hall's clutter be repeated: ``--tiles 10 5`` is one hall of 80 x 90 m.
+Give a site file, or repeat the bundled hall's clutter: ``--tiles 10 5`` is one hall of 80 x 90 m.
 """
 
 import argparse

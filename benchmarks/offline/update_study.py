@@ -1,8 +1,8 @@
-"""What an update keeps and what that costs: objects of the bundled hall moved and added, by tolerance.
+"""Cells that an update keeps and the loss of accuracy, by tolerance: objects of the bundled hall are moved and added.
 
 For each change, the hall's table is updated with every tolerance and compared with the exact table (tolerance 0, which
-is that of a whole build): cells that are kept, the held-out log-likelihood of kept cells under their new measure, and
-the distance between the fixes of both tables. Tables are kept in ``--folder``, so that a second run only compares.
+equals a new build): cells that are kept, the held-out log-likelihood of kept cells under their new measure, and the
+distance between the fixes of both tables. Tables are kept in ``--folder``; a second run only compares them.
 """
 
 import argparse

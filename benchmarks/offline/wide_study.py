@@ -1,8 +1,8 @@
-"""What the settings of the sums buy at the wide windows: held-out log-likelihood, size, time, and errors of fixes.
+"""Effect of the settings of the sums at the wide windows: held-out log-likelihood, size, time, and errors of fixes.
 
-All cells of the bundled hall's wide windows are made with each setting, level upon level, on the finest level of one
-table. Beside them stand cells fitted directly to rays at the wide window: tubes, and em on the cells that are judged.
-Held-out points are judged as measured, with the least noise for which the window is looked up. docs/fit-study.md
+All cells of the bundled hall's wide windows are made with each setting, level by level, from the finest level of one
+table. They are compared with cells fitted directly to rays at the wide window: by tubes, and by em for the evaluated
+cells. Held-out points have the smallest measurement noise for which the window is looked up. docs/fit-study.md
 discusses the results.
 """
 

@@ -1,1 +1,1 @@
-"""Attacks on the service, bounded in number and time; each ends with status 1 where a bound does not hold."""
+"""Attacks on the service, bounded in number and time; each ends with status 1 if a bound does not hold."""

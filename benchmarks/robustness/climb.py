@@ -1,15 +1,16 @@
-"""A search for messages that hold up a service: it climbs towards what costs most, by the structure of messages.
+"""A search for messages that block a service: a hill climb over the structure of messages towards the highest cost.
 
     python -m benchmarks.robustness.climb [--table hall.h5] [--minutes 60]
 
 In turns it changes a report (more measurements, heavier tails, wider deviations, other stations), a batch of such
-reports, and the document of a message of another format, and keeps what holds the event loop longer, or what takes
-longer where that is the same. While it does, another thread asks for `/livez`.
+reports, and the document of a message of another format, and keeps a change that blocks the event loop longer, or takes
+longer in total at the same blocking time. Meanwhile another thread requests `/livez`.
 
 Bounds: no callback of the loop takes more than `--held` seconds of processor time of the loop's thread; an answer, or
-503 or 504, comes within the limit of a fix and `--slack` seconds; `/livez` answers within `--livez` seconds but for
-`--late-share` of the times, as a machine with other work holds any process up: how late a thread that only sleeps
-wakes is printed beside it. By the clock, the loop's longest callback is printed and not bounded for the same reason.
+503 or 504, comes within the limit of a fix and `--slack` seconds; `/livez` answers within `--livez` seconds except in a
+fraction `--late-share` of the requests, because other work on the machine delays any process: the delay of a thread
+that only sleeps is printed for comparison. For the same reason, the loop's longest callback by wall time is printed but
+not bounded.
 """
 
 import http.client

@@ -1,14 +1,14 @@
-"""Flips single bits of a table and checks each of the files in a process of its own.
+"""Flips single bits of a table and checks each of the files in a separate process.
 
     python -m benchmarks.robustness.flips [--table hall.h5] [--runs 5] [--count 1000] [--seed 2026]
 
-Half of the bits are in HDF5's own administration. A file with a flipped bit is refused in one line, or it is the same
+Half of the bits are in HDF5's metadata. A file with a flipped bit is refused in one line, or it is the same
 table by its ``table_id``, or its check is ended by a signal, at its limit of processor time or memory; anything else
-is a fault. Without a table a small one is made.
+is a fault. Without a table, a small one is built.
 
-With ``--flip`` it is the process that forks the checks, which a process with threads must not, and writes what became
-of each, a JSON list a line: place, bit, status of the process, message or ``table_id``. To start Python for each
-takes a hundred times as long.
+With ``--flip`` it is the process that forks the checks, because a process with threads must not fork. It writes each
+result as a line of JSON: offset, bit, status of the process, message or ``table_id``. Starting Python for each check
+would take a hundred times as long.
 """
 
 import argparse

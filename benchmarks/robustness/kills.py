@@ -1,4 +1,4 @@
-"""Kills of workers and of their service under load, and bad files among its tables.
+"""Kills workers and their service under load, and puts invalid files among its tables.
 
     python -m benchmarks.robustness.kills [--table hall.h5] [--workers 200] [--parents 20] [--bad-files 50]
 

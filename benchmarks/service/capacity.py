@@ -1,8 +1,8 @@
-"""What a service needs: processor time a fix, memory, time to start. docs/capacity.md plans with these figures.
+"""Resources of a service: processor time per fix, memory, time to start. docs/capacity.md uses these results.
 
-A real ``rayfix serve`` of one worker answers reports of uniform drops; its processor time is counted, not the wall
-clock, so that the figures hold on a machine that is busy with other work too; then one of several workers, whose memory
-is told. Run with ``--table`` on any table.
+A real ``rayfix serve`` of one worker answers reports of uniform drops; its processor time is measured, not wall time,
+because the machine may be busy with other work. Then the memory of a service with several workers is measured. Run with
+``--table`` on any table.
 """
 
 import http.client

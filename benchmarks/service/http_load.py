@@ -1,4 +1,4 @@
-"""Requests per second of the service, beside a plain FastAPI endpoint that computes nothing, and its memory.
+"""Requests per second of the service, compared with a plain FastAPI endpoint that computes nothing, and its memory.
 
     python -m benchmarks.service.http_load hall.h5 [--workers 1 2] [--seconds 5] [--rounds 3] [--swaps 20]
     python -m benchmarks.service.http_load hall.h5 --memory 200000
@@ -6,11 +6,11 @@
 
 The load comes from `wrk` (Debian package wrk) over 16 connections on loopback. Both servers are uvicorn, on uvloop
 and with httptools; the plain one is started by uvicorn's command, validates the same report with the same models and
-answers with the example of a fix. They take turns, and the medians of the rounds are compared, since other work on the
-machine slows both. The processor time that each server takes for a request is less disturbed by it.
+answers with the example of a fix. They run alternately, and medians over the rounds are compared, because other work on
+the machine slows both. Processor time per request is less affected.
 
-`--memory` loads one process as fast as it goes, `--steady` several for minutes at a moderate rate with reports of all
-kinds; both print the memory of the service's processes.
+`--memory` loads one process at the highest possible rate, `--steady` loads several for minutes at a moderate rate with
+reports of all kinds. Both print the memory of the service's processes.
 """
 
 import argparse

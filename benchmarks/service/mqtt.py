@@ -1,8 +1,8 @@
-"""Bluetooth-like streams over a real broker: locators' angles in, positions out; throughput, latency and loss.
+"""Bluetooth-like streams of angles over a real broker: throughput, latency and loss of positions.
 
-Each locator that hears a packet of a tag publishes its angle; those of a packet come in random order. Latency is from
-when the service takes a packet's first angle to when its position is back here. A packet that some locator does not
-hear waits for the window, which is told apart.
+Each locator that receives a packet of a tag publishes its angle; the angles of a packet arrive in random order. Latency
+is measured from the arrival of a packet's first angle at the service to the arrival of its position here. A packet that
+some locator does not receive waits for the window; its latency is reported separately.
 """
 
 import asyncio

@@ -1,1 +1,1 @@
-"""The forward solver beside another one, and angle errors of antenna arrays."""
+"""Comparison of the forward solver with another one, and angle errors of antenna arrays."""

@@ -1,6 +1,6 @@
 """Angle errors of antenna arrays in a scene: Delay-and-Sum, MVDR, MUSIC and ESPRIT on simulated snapshots.
 
-Run with ``--table`` on any table, of which the scene and the stations count; the bundled hall's is built when left out.
+Run with ``--table`` on any table, of which scene and stations are used; by default the bundled hall's is built.
 """
 
 import json

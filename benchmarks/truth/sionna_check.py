@@ -1,6 +1,6 @@
-"""The forward solver beside Sionna RT: all paths of some stations to random points, in the bundled hall or any scene.
+"""The forward solver compared with Sionna RT: all paths of some stations to random points, in any scene.
 
-Needs the extra ``sionna`` and LLVM; docs/evaluation.md says how.
+Needs the extra ``sionna`` and LLVM; see docs/evaluation.md.
 """
 
 import argparse

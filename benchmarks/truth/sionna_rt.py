@@ -1,4 +1,4 @@
-"""The forward solver beside Sionna RT: the same scene, the same stations and points, path by path.
+"""The forward solver compared with Sionna RT: the same scene, stations and points, path by path.
 
 Sionna RT (J. Hoydis et al., "Sionna RT: differentiable ray tracing for radio propagation modeling", 2023) shoots rays
 to find which triangles a path may visit, and refines each candidate with the image method, in single precision. It

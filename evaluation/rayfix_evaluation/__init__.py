@@ -1,6 +1,7 @@
-"""Judging a site: simulated drops, bounds, baselines, the paper's method, planning maps, reports and pictures.
+"""Evaluation of a site: simulated drops, bounds, baselines, the paper's method, planning maps, reports and pictures.
 
-Its public face is the command line (``rayfix evaluate``, ``plan``, ``plot``); all modules may change without notice.
+Its public interface is the command line (``rayfix evaluate``, ``plan``, ``plot``). All modules may change without
+notice.
 """
 
 from pathlib import Path

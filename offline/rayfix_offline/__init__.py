@@ -1,6 +1,6 @@
-"""The offline half: a site and its mesh become rays, mixtures and a table.
+"""The offline half: builds a table from a site and its mesh, by rays and mixtures.
 
-Its public face is ``rayfix.build`` and the command line (see :mod:`rayfix`); all modules may change without notice.
+Its public interface is ``rayfix.build`` and the command line (see :mod:`rayfix`); modules may change without notice.
 """
 
 from pathlib import Path

@@ -1,7 +1,7 @@
 """The offline job: build the table of a site file and its scene.
 
-Finished blocks of cells are saved in shards beside the table, so that an interrupted or killed build continues where it
-ended. Stations and cells of a former table that are still valid are taken from there.
+Finished blocks of cells are saved in shards beside the table, and an interrupted or killed build continues from them.
+Stations and cells of a former table that are still valid are taken from there.
 """
 
 import resource
@@ -133,7 +133,7 @@ def build_table(
     """
     begin = time.perf_counter()
     if not 0.0 <= tolerance < 1.0:
-        raise BuildError(f"a tolerance of {tolerance:g} is no fraction of a cell's mass; give 0 or more, below 1")
+        raise BuildError(f"a tolerance of {tolerance:g} is not a fraction of a cell's mass; give 0 or more, below 1")
     report = progress or (lambda stage, done, total: None)
     site_path, table_path = Path(site_path), Path(table_path)
     site = read_site(site_path)

@@ -18,7 +18,7 @@ MIN_WINDOW_RATIO = 1.5
 """Smallest ratio of a window to the one before: its cells are sums of finer cells, which must add up to its window."""
 
 LARGEST_COORDINATE = 5e7
-"""m; maps have coordinates of up to 2e7 m, and single precision tells no walls apart far beyond."""
+"""m; maps have coordinates of up to 2e7 m, and far beyond, single precision cannot distinguish walls."""
 
 WINDOWS_PATH = "write Windows paths with / or in single quotes; in double quotes, \\ begins an escape sequence"
 
@@ -59,7 +59,7 @@ class SiteSection(_Section):
     @classmethod
     def _no_escapes(cls, scene: str) -> str:
         if any(ord(letter) < 32 for letter in scene):  # "C:\temp\new.glb" has a tab and a new line
-            raise ValueError(f"{scene!r} is no file name: {WINDOWS_PATH}")
+            raise ValueError(f"{scene!r} is not a file name: {WINDOWS_PATH}")
         return scene
 
 
@@ -206,7 +206,7 @@ class StationSection(_Section):
         given = [key for key in _BORESIGHT_KEYS if getattr(self, key) is not None]
         if given and self.orientation_deg is not None:
             raise ValueError(
-                f"orientation_deg and {', '.join(given)} both say how the array is turned; give one of them: "
+                f"orientation_deg and {', '.join(given)} both state the orientation of the array; give one of them: "
                 "the boresight, or the orientation of 3GPP TR 38.901"
             )
         return self
@@ -237,8 +237,9 @@ class StationSection(_Section):
     def built_from(self) -> dict[str, Any]:
         """Return what the station's part of the table depends on: position and field of view.
 
-        The fusion subtracts the bias and turns the angles. So the orientation counts only where not all directions are
-        in view, and then only where the boresight points: as the orientation of a frame that has it as its x axis.
+        The fusion subtracts the bias and turns the angles. So the orientation matters only if the field of view is
+        limited, and then only by the boresight: it is returned as the orientation of a frame with the boresight as x
+        axis.
         """
         looks = [0.0, 0.0, 0.0]
         if self.field_of_view_deg < 360.0:
@@ -270,7 +271,7 @@ class SiteFile(_Section):
         return self
 
     def moved(self, by: NDArray[np.float64]) -> "SiteFile":
-        """Return the same site elsewhere, its stations moved by a vector of shape (3,), m."""
+        """Return the site with its stations translated by a vector of shape (3,), m."""
         if not np.any(by):
             return self
         stations = tuple(
@@ -296,7 +297,7 @@ def read_site(path: str | Path) -> SiteFile:
     Raises
     ------
     SiteError
-        When the file is missing, is not TOML, or does not fit; the message names every offending key.
+        When the file is missing, is not TOML, or is not valid; the message names every offending key.
     """
     path = Path(path)
     try:
@@ -307,14 +308,14 @@ def read_site(path: str | Path) -> SiteFile:
     except OSError as error:
         raise SiteError(f"{path} cannot be read ({error.strerror}); give a TOML site file") from error
     except UnicodeDecodeError as error:
-        raise SiteError(f"{path} is no text in UTF-8; give a TOML site file") from error
+        raise SiteError(f"{path} is not UTF-8 text; give a TOML site file") from error
     except tomllib.TOMLDecodeError as error:
         raise SiteError(f"{path} is not valid TOML: {error}{_hint(error)}") from error
     return parse_site(document, source=str(path))
 
 
 def _hint(error: tomllib.TOMLDecodeError) -> str:
-    """Say what a Windows path in TOML wants, where the error is that of one in double quotes."""
+    """Explain how to write a Windows path, if the error is that of one in double quotes."""
     if re.search(r"escape|hex value", str(error), re.IGNORECASE) is None:
         return ""
     return f"; {WINDOWS_PATH}"
@@ -331,7 +332,7 @@ def parse_site(document: dict[str, Any], *, source: str = "site") -> SiteFile:
     Raises
     ------
     SiteError
-        When it does not fit; the message names every offending key.
+        When it is not valid; the message names every offending key.
     """
     try:
         return SiteFile.model_validate(document)

@@ -1,6 +1,6 @@
 """A client of the service: :class:`Client` and :class:`AsyncClient`, their answers and errors.
 
-It needs the extra ``rayfix[client]`` alone, neither that of the service nor any table.
+It needs only the extra ``rayfix[client]``; no other extra and no table.
 """
 
 from rayfix.client.asynchronous import AsyncClient

@@ -1,7 +1,7 @@
-"""Requests and their answers without input or output; both clients drive the same flows.
+"""Requests and answers as generators without I/O, which both clients drive.
 
-A flow is a generator. It yields a :class:`Call`, for which it is sent a :class:`Reply` or a :class:`NoReply`, or a
-:class:`Pause`, and returns what the caller wants.
+A flow is a generator. It yields a :class:`Call`, for which the client sends it a :class:`Reply` or a :class:`NoReply`,
+or it yields a :class:`Pause`. It returns the result of the method.
 """
 
 import json
@@ -18,10 +18,10 @@ from rayfix.errors import AnswerError, ClientError, ProblemError, ProblemField, 
 T = TypeVar("T")
 
 BATCH_REPORTS = 1000
-"""Reports of one batch; the service accepts no more."""
+"""Largest number of reports of a batch; the service accepts no more."""
 
 BATCH_BYTES = 8 << 20
-"""Bytes of one batch; the service accepts twice as many."""
+"""Largest size of a batch, bytes; the service accepts twice as many."""
 
 MESSAGE_FORMATS = ("nrppa", "silabs")
 """Formats of other systems' messages that are JSON."""
@@ -52,7 +52,7 @@ class Reply:
 
 @dataclass(frozen=True, kw_only=True)
 class NoReply:
-    """There was no answer; ``reason`` says why."""
+    """There was no answer, for the given reason."""
 
     reason: str
 
@@ -68,7 +68,7 @@ Flow = Generator[Call | Pause, Reply | NoReply | None, T]
 
 
 def request(call: Call, parse: Callable[[Any], T], policy: RetryPolicy, random: Random) -> Flow[T]:
-    """Send a request, retry it where that may help, and read its answer.
+    """Send a request, retry it if that may help, and read its answer.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def request(call: Call, parse: Callable[[Any], T], policy: RetryPolicy, random: 
         if pause is None:
             if isinstance(reply, NoReply):
                 tries = "" if attempt == 1 else f" after {attempt} attempts"
-                raise UnreachableError(f"the service does not answer{tries} ({reply.reason}); is its address right?")
+                raise UnreachableError(f"the service does not answer{tries} ({reply.reason}); check its address")
             return read(reply, parse)
         yield Pause(seconds=pause)
 
@@ -99,7 +99,7 @@ def read(reply: Reply, parse: Callable[[Any], T]) -> T:
     ProblemError
         For a problem document.
     AnswerError
-        For an answer that is not of this service.
+        For an answer that this service does not give.
     """
     try:
         document = json.loads(reply.body)
@@ -109,7 +109,7 @@ def read(reply: Reply, parse: Callable[[Any], T]) -> T:
         try:
             return parse(document)
         except (KeyError, TypeError, ValueError, AttributeError):
-            text = "is not one of this service, or of another version; is the address right?"
+            text = "is not that of a rayfix service of this version; check the address"
             raise AnswerError(f"the answer (status {reply.status}) {text}") from None
     raise problem(document, reply.status)
 
@@ -120,7 +120,7 @@ def problem(document: Any, status: int) -> ProblemError | AnswerError:
         errors = tuple(ProblemField(path=one["path"], message=one["message"]) for one in document["errors"])
         kind, detail = document["type"], document["detail"]
     except (KeyError, TypeError):
-        return AnswerError(f"the answer has the status {status} and no problem document; is the address right?")
+        return AnswerError(f"the answer has the status {status} and no problem document; check the address")
     error = RefusedReportError if kind in _REPORT_PROBLEMS else ProblemError
     return error(detail, kind=kind, status=status, errors=errors)
 
@@ -136,7 +136,7 @@ def stream_answer(message: str | bytes) -> FixAnswer | ProblemError:
     try:
         return batch_answers({"results": [json.loads(message)]}, 1)[0]
     except (KeyError, TypeError, ValueError, AttributeError):
-        raise AnswerError("an answer of the stream is not a fix; is the address right?") from None
+        raise AnswerError("an answer of the stream is not a fix; check the address") from None
 
 
 def reason_of(error: Exception) -> str:
@@ -147,14 +147,14 @@ def reason_of(error: Exception) -> str:
 def report_bytes(report: Any) -> bytes:
     """Write a report: a mapping of the JSON that ``POST /v1/positions`` takes, or a ``rayfix.Report``."""
     if not isinstance(report, Mapping):
-        from rayfix_service.wire import report_to_document  # who has such a report has its package
+        from rayfix_service.wire import report_to_document  # a caller with such a report has this package
 
         report = report_to_document(report)
     return json.dumps(report, separators=(",", ":")).encode()
 
 
 def position_call(report: Any, query: Mapping[str, str]) -> Call:
-    """Call for the position of one report; a header names its target, for proxies that route by it."""
+    """Make the call for one report; a header names its target for proxies that route by target."""
     target = report.get("target_id") if isinstance(report, Mapping) else getattr(report, "target_id", None)
     headers = dict(_JSON)
     if isinstance(target, str) and target.isascii() and target.isprintable():
@@ -165,7 +165,7 @@ def position_call(report: Any, query: Mapping[str, str]) -> Call:
 def batch_calls(
     reports: Iterable[Any], query: Mapping[str, str], message_format: str | None = None
 ) -> Iterator[tuple[int, Call]]:
-    """Split reports, or messages of a format, into batches that the service accepts; yields each with its number."""
+    """Split reports or messages into batches that the service accepts; yields calls and numbers of reports."""
     path = "/v1/positions/batch" if message_format is None else f"/v1/positions/{_named(message_format)}/batch"
     batch: list[bytes] = []
     size = 0
@@ -181,7 +181,7 @@ def batch_calls(
 
 
 def message_call(message: Mapping[str, Any], message_format: str, query: Mapping[str, str]) -> Call:
-    """Call for the position of another system's message of JSON."""
+    """Make the call for a JSON message of another system."""
     path = f"/v1/positions/{_named(message_format)}"
     return Call(method="POST", path=path, query=query, headers=_JSON, body=report_bytes(message))
 
@@ -196,7 +196,7 @@ def lines_call(
     stdev_deg: float | None = None,
     tails: tuple[float, float] | None = None,
 ) -> Call:
-    """Call for the positions of u-blox lines; a height is z and its standard deviation, m."""
+    """Make the call for u-blox lines; a height is z and its standard deviation, m."""
     pairs = [(key, value) for key, value in query.items()]
     pairs += [("station", f"{anchor}={station}") for anchor, station in (stations or {}).items()]
     if height is not None:
@@ -212,13 +212,15 @@ def lines_call(
 
 
 def lines_answers(document: Any) -> list[FixAnswer | ProblemError]:
-    """Read the answers to lines, as many as there are."""
+    """Read the answers to lines, of any number."""
     return list(batch_answers(document, len(document["results"])))
 
 
 def _named(message_format: str) -> str:
     if message_format not in MESSAGE_FORMATS:
-        raise ClientError(f"format {message_format!r} is none of {', '.join(MESSAGE_FORMATS)}; u-blox has locate_lines")
+        raise ClientError(
+            f"format {message_format!r} is none of {', '.join(MESSAGE_FORMATS)}; use locate_lines for u-blox"
+        )
     return message_format
 
 

@@ -1,4 +1,4 @@
-"""The feed of fixes as a client sees it: events from lines, and reconnection."""
+"""The client's side of the feed of fixes: parsing of events, and reconnection."""
 
 import json
 from random import Random
@@ -38,7 +38,7 @@ class Feed:
         Raises
         ------
         AnswerError
-            When an event is not of this service.
+            When an event cannot be read.
         """
         self._attempt = 0
         event = self._reader.take(line)
@@ -47,7 +47,7 @@ class Feed:
         try:
             return fix_event(json.loads(event.data))
         except (KeyError, TypeError, ValueError, AttributeError):
-            raise AnswerError("an event of the feed is not a fix; is the address right?") from None
+            raise AnswerError("an event of the feed is not a fix; check the address") from None
 
     def refused(self, status: int, body: bytes, retry_after: str | None) -> float:
         """Return the pause after an answer that is not a feed, s.

@@ -1,7 +1,7 @@
-"""What the service answers, as frozen dataclasses of plain numbers and tuples.
+"""The service's answers as frozen dataclasses of numbers and tuples.
 
-Field names and units are those of the JSON; docs/measurements.md and the service's ``/docs`` describe them. Keys that a
-later version of the service adds are passed over.
+Field names and units are those of the JSON; docs/measurements.md and the service's ``/docs`` describe them. Unknown
+keys, which later versions of the service may add, are ignored.
 """
 
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """Result for one measurement; ``reason``: why it was not used, ``source``: where it stands in another message."""
+    """Result for one measurement; ``reason``: why it was not used, ``source``: its path in another system's message."""
 
     index: int
     used: bool
@@ -45,7 +45,7 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class SkippedMeasurement:
-    """A measurement of another system's message that no fix can use."""
+    """A measurement of another system's message that was not converted."""
 
     source: str
     reason: str
@@ -53,7 +53,7 @@ class SkippedMeasurement:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackAnswer:
-    """What is known of a target from all its reports; docs/tracking.md."""
+    """A target's state, estimated from all its reports; see docs/tracking.md."""
 
     state: TrackState
     timestamp: str
@@ -69,7 +69,7 @@ class TrackAnswer:
 
 @dataclass(frozen=True, kw_only=True)
 class FixAnswer:
-    """The answer to a report; ``track`` is there where the service follows targets, ``skipped`` of another message."""
+    """The answer to a report; ``track`` if the service tracks targets, ``skipped`` for messages of other systems."""
 
     status: Status
     target_id: str | None
@@ -92,7 +92,7 @@ class FixAnswer:
 
 @dataclass(frozen=True, kw_only=True)
 class FixEvent:
-    """A fix that the service made of anyone's report, with the report's JSON and the table's name."""
+    """A fix of any client's report, with the report's JSON and the table's name."""
 
     table: str
     report: Mapping[str, Any]
@@ -103,7 +103,8 @@ class FixEvent:
 class StationAnswer:
     """A station; bearing, downtilt and slant are its orientation as in 3GPP TR 38.901.
 
-    ``boresight_azimuth_deg`` and ``boresight_downtilt_deg`` are where its array looks, ``mounting`` is its local frame.
+    ``boresight_azimuth_deg`` and ``boresight_downtilt_deg`` are the direction of its array's boresight, ``mounting`` is
+    its local frame.
     """
 
     id: str
@@ -119,7 +120,7 @@ class StationAnswer:
 
 @dataclass(frozen=True, kw_only=True)
 class TableAnswer:
-    """A table that answers; ``name`` is what a client's ``table`` takes."""
+    """A served table; ``name`` is the value for a client's ``table``."""
 
     name: str
     table_id: str
@@ -134,7 +135,7 @@ class TableAnswer:
 
 
 def fix_answer(document: Mapping[str, Any]) -> FixAnswer:
-    """Read a fix; KeyError, TypeError or ValueError for what is none."""
+    """Read a fix; raises KeyError, TypeError or ValueError for other data."""
     track = document.get("track")
     return FixAnswer(
         status=document["status"],
@@ -176,12 +177,12 @@ def fix_answer(document: Mapping[str, Any]) -> FixAnswer:
 
 
 def fix_event(document: Mapping[str, Any]) -> FixEvent:
-    """Read an event of the feed; KeyError, TypeError or ValueError for what is none."""
+    """Read an event of the feed; raises KeyError, TypeError or ValueError for other data."""
     return FixEvent(table=document["table"], report=document["report"], fix=fix_answer(document["fix"]))
 
 
 def station_answers(document: Mapping[str, Any]) -> tuple[StationAnswer, ...]:
-    """Read the list of stations; KeyError, TypeError or ValueError for what is none."""
+    """Read the list of stations; raises KeyError, TypeError or ValueError for other data."""
     return tuple(
         StationAnswer(
             id=one["id"],
@@ -199,7 +200,7 @@ def station_answers(document: Mapping[str, Any]) -> tuple[StationAnswer, ...]:
 
 
 def table_answer(document: Mapping[str, Any]) -> TableAnswer:
-    """Read the summary of a table; KeyError, TypeError or ValueError for what is none."""
+    """Read the summary of a table; raises KeyError, TypeError or ValueError for other data."""
     return TableAnswer(
         name=document["name"],
         table_id=document["table_id"],
@@ -215,7 +216,7 @@ def table_answer(document: Mapping[str, Any]) -> TableAnswer:
 
 
 def table_answers(document: Mapping[str, Any]) -> tuple[TableAnswer, ...]:
-    """Read the list of tables; KeyError, TypeError or ValueError for what is none."""
+    """Read the list of tables; raises KeyError, TypeError or ValueError for other data."""
     return tuple(table_answer(one) for one in document["tables"])
 
 

@@ -16,18 +16,18 @@ _AGAIN = frozenset({429, 502, 503, 504})
 class RetryPolicy:
     """How often requests are repeated, and after which pauses.
 
-    A report may be sent twice: fixes are stateless, and tracks ignore a second report of the same time.
+    Sending a report twice is harmless: fixes are stateless, and tracks ignore a second report of the same time.
 
     Attributes
     ----------
     attempts : int
         Maximum number of attempts; 1 turns retries off.
     first_pause, longest_pause : float, s
-        The pause before attempt n + 1 is drawn from 0 to ``first_pause`` times 2 to the power n - 1, and at most the
-        longest, so that clients that lost the service at the same time do not return at the same time ("full jitter":
-        M. Brooker, "Exponential backoff and jitter", 2015).
+        The pause before attempt n + 1 is drawn uniformly between 0 and ``first_pause`` times 2 to the power n - 1, or
+        the longest pause if that is less. Clients that lost the service together then do not return together ("full
+        jitter": M. Brooker, "Exponential backoff and jitter", 2015).
     longest_retry_after : float, s
-        A service that asks for a longer pause than this is not asked again.
+        A request is not repeated if the service demands a longer pause than this.
 
     Raises
     ------
@@ -67,7 +67,7 @@ NO_RETRIES = RetryPolicy(attempts=1)
 
 
 def is_temporary(status: int) -> bool:
-    """Whether a status says that the same request may succeed later."""
+    """Whether the same request may succeed later, given the status."""
     return status in _AGAIN
 
 

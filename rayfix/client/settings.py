@@ -18,11 +18,11 @@ class ClientSettings:
     api_key : str or None
         Sent as ``Authorization: Bearer``.
     table : str or None
-        Name of the table, where the service has several.
+        Name of the table, if the service has several.
     track : bool or None
-        Whether to track targets; None leaves it to the service.
+        Whether to track targets; None for the service's default.
     timeout : float, s
-        Time limit of connecting, and of each part of an answer.
+        Time limit for connecting and for each read.
     retries : RetryPolicy
     """
 

@@ -106,16 +106,16 @@ class Client:
         return self._ask(position_call(report, self.settings.position_query), fix_answer)
 
     def locate_as(self, report: Mapping[str, Any] | object, output: str) -> dict[str, Any]:
-        """Locate one report; returns the answer's JSON in a format of docs/formats.md, such as ``"omlox"``."""
+        """Locate one report; returns JSON in an output format of docs/formats.md, such as ``"omlox"``."""
         return self._ask(position_call(report, self.settings.position_query | {"output": output}), dict)
 
     def locate_batch(self, reports: Iterable[Mapping[str, Any] | object]) -> list[FixAnswer | ProblemError]:
-        """Locate any number of reports, in as many requests as that takes.
+        """Locate any number of reports, in as many requests as necessary.
 
         Returns
         -------
         list of (FixAnswer or ProblemError)
-            In the order of the reports; the error, not raised, of a report that cannot be used.
+            In the order of the reports. The error of a report that cannot be used is returned, not raised.
         """
         answers: list[FixAnswer | ProblemError] = []
         for count, call in batch_calls(reports, self.settings.position_query):
@@ -128,7 +128,7 @@ class Client:
         Parameters
         ----------
         message : Mapping
-            Its JSON, as docs/formats.md has it.
+            Its JSON; see docs/formats.md.
         message_format : {"nrppa", "silabs"}
         """
         return self._ask(message_call(message, message_format, self.settings.position_query), fix_answer)
@@ -136,7 +136,7 @@ class Client:
     def locate_messages(
         self, messages: Iterable[Mapping[str, Any]], message_format: str
     ) -> list[FixAnswer | ProblemError]:
-        """Locate any number of messages of another system, as :meth:`locate_batch` does reports.
+        """Locate any number of messages of another system; see :meth:`locate_batch`.
 
         Parameters
         ----------
@@ -164,16 +164,16 @@ class Client:
         ----------
         lines : str
         stations : Mapping, optional
-            Stations by anchor, for those whose id is no station's.
+            Stations by anchor; an anchor that is not in the map is itself a station's identifier.
         height : tuple of 2 floats, m, optional
             Known height of the tags and its standard deviation.
         confidence : float, optional
-            Probability with which accuracies are to hold.
+            Probability that the stated accuracies hold.
         stdev_deg : float, deg, optional
             Standard deviation of the angles, which the lines do not state.
         tails : tuple of 2 floats, optional
-            Probability that an angle's error is of a wider Gaussian, and that one's standard deviation in those of the
-            other.
+            Probability that an angle's error has a wider Gaussian distribution, and the ratio of the two standard
+            deviations.
         """
         call = lines_call(
             lines,
@@ -191,7 +191,7 @@ class Client:
         return self._ask(Call(method="GET", path="/v1/stations", query=self.settings.table_query), station_answers)
 
     def table(self) -> TableAnswer:
-        """Describe the table that answers."""
+        """Describe the table that answers reports."""
         return self._ask(Call(method="GET", path="/v1/table", query=self.settings.table_query), table_answer)
 
     def tables(self) -> tuple[TableAnswer, ...]:
@@ -199,7 +199,7 @@ class Client:
         return self._ask(Call(method="GET", path="/v1/tables"), table_answers)
 
     def ready(self) -> bool:
-        """Whether the service can locate now; asks once."""
+        """Whether the service can locate now; makes one attempt."""
         try:
             self._drive(request(Call(method="GET", path="/readyz"), dict, NO_RETRIES, self._random))
         except (ProblemError, UnreachableError):
@@ -207,14 +207,14 @@ class Client:
         return True
 
     def fixes(self, target_id: str | None = None) -> Iterator[FixEvent]:
-        """Listen to the fixes that the service makes of anyone's reports, until the iteration is ended.
+        """Receive the fixes of all clients' reports until the iteration is ended.
 
-        A lost connection is opened again; fixes in between are missing.
+        A lost connection is re-established; fixes in between are missed.
 
         Parameters
         ----------
         target_id : str, optional
-            Listen to the fixes of this target only.
+            Receive the fixes of this target only.
         """
         query = self.settings.feed_query(target_id)
         feed = Feed(self.settings.retries, self._random)
@@ -237,9 +237,9 @@ class Client:
             pause(seconds)
 
     def stream(self, reports: Iterable[Mapping[str, Any] | object]) -> Iterator[FixAnswer | ProblemError]:
-        """Send reports over one web socket, each when the last is answered; yields the answers.
+        """Send reports over one web socket, each after the answer to the previous one; yields the answers.
 
-        For one sender of many reports this is faster than requests. A lost connection is not opened again.
+        For one sender of many reports this is faster than requests. A lost connection is not re-established.
         """
         with needs_extra("client"):
             from websockets.exceptions import WebSocketException
@@ -273,7 +273,7 @@ class Client:
             answer = self._http.request(
                 call.method,
                 self.settings.base + call.path,
-                params=dict(call.query) or None,  # an empty one would take that of the path away
+                params=dict(call.query) or None,  # an empty query would remove that of the path
                 headers=dict(call.headers),
                 content=call.body,
             )

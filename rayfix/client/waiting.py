@@ -1,6 +1,6 @@
-"""Where the two clients differ by more than ``await``: pauses and web sockets, each for asyncio and blocking.
+"""Pauses and web sockets, for asyncio and blocking: the parts of the two clients that differ by more than ``await``.
 
-The blocking client is generated from the asynchronous one; there, ``async_pause`` becomes ``pause``, and so on.
+The generator of the blocking client replaces ``async_pause`` by ``pause``, and so on.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""What the commands' arguments share: how a command is added, values that are checked, options that several have."""
+"""Arguments of commands: adding a command, types that check values, and options of several commands."""
 
 import argparse
 import math
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rayfix_service.adapters.omlox_hub import HubSettings
 
 AddCommand = Callable[[str, Callable[[argparse.Namespace], int], str], argparse.ArgumentParser]
-"""Makes a command of a name, what it runs, and what it does in words."""
+"""Adds a command, given its name, the function that it runs, and its help text."""
 
 _Number = TypeVar("_Number", int, float)
 
@@ -25,30 +25,30 @@ def job_count(text: str) -> int:
         text,
         int,
         lambda jobs: jobs == -1 or jobs >= 1,
-        "is not a number of jobs; give 1 or more, or -1 for one per core",
+        "is not a valid number of jobs; give 1 or more, or -1 for one per core",
     )
 
 
 def report_rate(text: str) -> float:
-    """Read a number of reports a second."""
+    """Read a number of reports per second."""
     return _number(
-        text, float, lambda rate: 0.0 < rate < 1e9, "is no rate; give a number of reports a second, e.g. 100"
+        text, float, lambda rate: 0.0 < rate < 1e9, "is not a valid rate; give a number of reports per second, e.g. 100"
     )
 
 
 def positive(text: str) -> float:
     """Read a limit."""
-    return _number(text, float, lambda limit: 0.0 < limit < 1e9, "is no limit; give a number above 0, e.g. 10")
+    return _number(text, float, lambda limit: 0.0 < limit < 1e9, "is not a valid limit; give a number above 0, e.g. 10")
 
 
 def drop_count(text: str) -> int:
     """Read a number of drops; fewer than two have no percentiles."""
-    return _number(text, int, lambda drops: drops >= 2, "is no number of drops; give 2 or more")
+    return _number(text, int, lambda drops: drops >= 2, "is not a valid number of drops; give 2 or more")
 
 
 def seed_number(text: str) -> int:
     """Read a seed of random numbers."""
-    return _number(text, int, lambda seed: seed >= 0, "is no seed; give a whole number, 0 or more")
+    return _number(text, int, lambda seed: seed >= 0, "is not a valid seed; give an integer, 0 or more")
 
 
 def mass_share(text: str) -> float:
@@ -59,18 +59,18 @@ def mass_share(text: str) -> float:
 
 
 def probability(text: str) -> float:
-    """Read a probability with which accuracies are to hold."""
-    return _number(text, float, lambda p: 0.01 <= p <= 0.99, "is no such probability; give 0.01 to 0.99, e.g. 0.95")
+    """Read the probability that stated accuracies hold."""
+    return _number(text, float, lambda p: 0.01 <= p <= 0.99, "is not a valid probability; give 0.01 to 0.99, e.g. 0.95")
 
 
 def coordinate(text: str) -> float:
     """Read a coordinate."""
-    return _number(text, float, math.isfinite, "is no coordinate; give a number of metres")
+    return _number(text, float, math.isfinite, "is not a coordinate; give a number of metres")
 
 
 def at_least_one(text: str) -> int:
-    """Read a whole number from 1 on."""
-    return _number(text, int, lambda number: 1 <= number < 1 << 31, "is no whole number from 1 on")
+    """Read an integer of 1 or more."""
+    return _number(text, int, lambda number: 1 <= number < 1 << 31, "is not an integer of 1 or more")
 
 
 def web_origin(text: str) -> str:
@@ -79,7 +79,7 @@ def web_origin(text: str) -> str:
     whole = parts.scheme in ("http", "https") and parts.netloc and text == f"{parts.scheme}://{parts.netloc}"
     if text != "*" and not whole:
         raise argparse.ArgumentTypeError(
-            f"{text!r} is no origin; give scheme, host and port without a path, e.g. https://maps.example.com"
+            f"{text!r} is not an origin; give scheme, host and port without a path, e.g. https://maps.example.com"
         )
     return text
 
@@ -106,50 +106,50 @@ def _number(text: str, kind: Callable[[str], _Number], fits: Callable[[_Number],
 
 
 def add_jobs_argument(command: argparse.ArgumentParser, what: str) -> None:
-    """Add the option of how many processes work at a time."""
+    """Add the option for the number of parallel workers."""
     command.add_argument("--jobs", type=job_count, default=-1, metavar="N", help=f"{what} (default: one per core)")
 
 
 def add_progress_argument(command: argparse.ArgumentParser) -> None:
-    """Add the option of commands that take a while."""
+    """Add the option of commands that show progress."""
     command.add_argument("--no-progress", action="store_true", help="show no progress bar")
 
 
 def add_output_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the options of how an answer is written, and of what the report leaves out."""
+    """Add the options for the output format and for data that the report does not contain."""
     command.add_argument("--output", choices=_OUTPUTS, default="native", help="format of the answer (default: native)")
     command.add_argument(
         "--station",
         action="append",
         default=[],
         metavar="NAME=STATION",
-        help="the station that the report calls NAME; may be given several times",
+        help="the station with the name NAME in the report; may be given several times",
     )
     command.add_argument(
         "--height",
         type=float,
         nargs=2,
         metavar=("Z", "STDEV"),
-        help="known height of the target in the scene and its standard deviation, m",
+        help="known height (z) of the target and its standard deviation, m",
     )
 
 
 def add_confidence_argument(command: argparse.ArgumentParser) -> None:
-    """Add the option of how probable it is that accuracies hold."""
+    """Add the option for the probability that stated accuracies hold."""
     command.add_argument(
         "--confidence",
         type=probability,
         metavar="P",
-        help="probability with which the accuracies of the answer hold, 0.01 to 0.99 (default: the report's, or 0.68)",
+        help="probability that the stated accuracies hold, 0.01 to 0.99 (default: the report's, or 0.68)",
     )
 
 
 def add_hub_argument(command: argparse.ArgumentParser) -> None:
-    """Add the option of commands that tell an omlox hub."""
+    """Add the options of commands that send positions to an omlox hub."""
     command.add_argument(
         "--omlox-hub",
         metavar="URL",
-        help="also tell this omlox hub of all positions, e.g. http://hub:8081/v2; "
+        help="also send all positions to this omlox hub, e.g. http://hub:8081/v2; "
         f"a token is taken from the environment variable {_HUB_VARIABLE}",
     )
     command.add_argument(
@@ -157,7 +157,7 @@ def add_hub_argument(command: argparse.ArgumentParser) -> None:
         type=at_least_one,
         default=4,
         metavar="N",
-        help="of the hub's answer that are read, KiB (default: 4)",
+        help="bytes of the hub's answer to read, KiB (default: 4)",
     )
 
 

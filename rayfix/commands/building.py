@@ -18,17 +18,19 @@ def add_commands(add: AddCommand) -> None:
 
     build = add("build", _build, "build the table of a site")
     build.add_argument("site", type=Path, metavar="SITE.toml", help="site file")
-    build.add_argument("-o", "--output", type=Path, required=True, metavar="T.h5", help="where the table goes")
+    build.add_argument("-o", "--output", type=Path, required=True, metavar="T.h5", help="path of the new table")
     add_jobs_argument(build, "cells fitted at a time")
     build.add_argument("--cluster", metavar="ADDRESS", help="let the workers of this Dask scheduler fit the cells")
-    build.add_argument("--former", type=Path, metavar="OLD.h5", help="table to take over from (default: one at T.h5)")
+    build.add_argument(
+        "--former", type=Path, metavar="OLD.h5", help="table to reuse cells from (default: the one at T.h5)"
+    )
     build.add_argument(
         "--tolerance",
         type=mass_share,
         default=0.0,
         metavar="SHARE",
-        help="also keep cells of the former table whose rays have changed by this share at most, e.g. 0.01; "
-        "the table is then no longer exactly that of a whole build, and says so (default: 0)",
+        help="also keep cells of the former table if their rays have changed by at most this fraction, e.g. 0.01; "
+        "the table then differs from that of a new build and records by how much (default: 0)",
     )
     add_progress_argument(build)
     build.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -37,7 +39,7 @@ def add_commands(add: AddCommand) -> None:
     info.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
     info.add_argument("--json", action="store_true", help="as JSON")
 
-    verify = add("verify", _verify, "read a whole table and compare its checksums")
+    verify = add("verify", _verify, "read all of a table and compare its checksums")
     verify.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
 
 
@@ -97,5 +99,5 @@ def _verify(options: argparse.Namespace) -> int:
     from rayfix_tables.checked import open_checked
 
     table = open_checked(options.table)
-    print(f"{options.table} is whole: table_id {table.table_id}")
+    print(f"{options.table} is intact: table_id {table.table_id}")
     return 0

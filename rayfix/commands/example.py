@@ -10,12 +10,12 @@ from rayfix.own_command import own_command
 
 def add_commands(add: AddCommand) -> None:
     """Add the commands to the command line."""
-    demo = add("demo", _demo, "run the whole main job on the bundled hall and draw a picture of the fix")
+    demo = add("demo", _demo, "build, serve and locate in the bundled hall, and draw a picture of the fix")
     demo.add_argument("-o", "--output", type=Path, default=Path("demo"), metavar="DIR", help="folder (default: demo)")
     add_jobs_argument(demo, "cells fitted at a time")
 
     example = add("example", _example, "write the bundled hall: hall.glb, site.toml, report.json")
-    example.add_argument("folder", type=Path, metavar="DIR", help="folder, made if need be")
+    example.add_argument("folder", type=Path, metavar="DIR", help="folder, created if necessary")
 
 
 def _demo(options: argparse.Namespace) -> int:

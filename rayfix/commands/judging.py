@@ -1,4 +1,4 @@
-"""How well a site can be located in: ``rayfix plan`` and ``rayfix evaluate``."""
+"""Accuracy of a site: ``rayfix plan`` and ``rayfix evaluate``."""
 
 import argparse
 import json
@@ -19,29 +19,31 @@ def add_commands(add: AddCommand) -> None:
     plan = add("plan", _plan, "forecast errors and coverage over the floor of a table and draw the map")
     plan.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
     plan.add_argument("-o", "--output", type=Path, required=True, metavar="MAP.png", help="picture: .png, .svg or .pdf")
-    plan.add_argument("--height", type=float, required=True, metavar="Z", help="of the targets in the scene, m")
+    plan.add_argument("--height", type=float, required=True, metavar="Z", help="height (z) of the targets, m")
     plan.add_argument("--azimuth-stdev-deg", type=float, default=1.0, metavar="DEG", help="(default: 1)")
-    plan.add_argument("--zenith-stdev-deg", type=float, metavar="DEG", help="(default: that of the azimuth)")
+    plan.add_argument("--zenith-stdev-deg", type=float, metavar="DEG", help="(default: as the azimuth)")
     plan.add_argument("--times", choices=("none", "pt", "toa", "tdoa"), default="none", help="(default: none)")
     plan.add_argument(
-        "--range-stdev-m", type=float, default=0.5, metavar="M", help="of times, as length (default: 0.5)"
+        "--range-stdev-m",
+        type=float,
+        default=0.5,
+        metavar="M",
+        help="standard deviation of times, as length (default: 0.5)",
     )
     plan.add_argument("--beside", type=Path, metavar="OTHER.h5", help="table of the site with a station added or moved")
     plan.add_argument("--spacing-m", type=float, default=0.5, metavar="M", help="side of the squares (default: 0.5)")
     plan.add_argument("--threshold-m", type=float, default=1.0, metavar="M", help="largest useful error (default: 1)")
     plan.add_argument("--draws", type=int, default=4, help="reports from each square (default: 4)")
-    plan.add_argument("--seed", type=seed_number, default=1, help="of places and noise (default: 1)")
+    plan.add_argument("--seed", type=seed_number, default=1, help="seed of positions and noise (default: 1)")
     add_progress_argument(plan)
     plan.add_argument("--json", action="store_true", help="print the map as JSON, one line for each table")
 
-    evaluate = add("evaluate", _evaluate, "measure how well a site can be located in, and write a report")
+    evaluate = add("evaluate", _evaluate, "measure the accuracy of a site with simulated drops and write a report")
     evaluate.add_argument("site", type=Path, metavar="SITE.toml", help="site file")
     evaluate.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the report")
-    evaluate.add_argument("--table", type=Path, metavar="T.h5", help="the site's table (default: it is built)")
+    evaluate.add_argument("--table", type=Path, metavar="T.h5", help="the site's table (default: it is built first)")
     evaluate.add_argument("--quick", action="store_true", help="few drops: some minutes instead of half an hour")
-    evaluate.add_argument(
-        "--drops", type=drop_count, metavar="N", help="drops of each study instead of the usual numbers"
-    )
+    evaluate.add_argument("--drops", type=drop_count, metavar="N", help="number of drops of each study")
     evaluate.add_argument(
         "--seed", type=seed_number, default=2026, help="the same seed gives the same results (default: 2026)"
     )

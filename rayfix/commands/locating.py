@@ -23,7 +23,7 @@ def add_commands(add: AddCommand) -> None:
     """Add the commands to the command line."""
     locate = add("locate", _locate, "locate the reports of a file")
     locate.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
-    locate.add_argument("report", type=Path, metavar="REPORT.json", help="file of the measurements")
+    locate.add_argument("report", type=Path, metavar="REPORT.json", help="file with the measurements")
     locate.add_argument("--format", choices=_INPUTS, default="native", help="format of the report (default: native)")
     add_output_arguments(locate)
     add_confidence_argument(locate)
@@ -35,12 +35,12 @@ def add_commands(add: AddCommand) -> None:
         type=float,
         nargs=2,
         metavar=("SHARE", "SCALE"),
-        help="probability that an error of such an angle is of a wider Gaussian, and by how much it is wider "
+        help="probability that such an error has a wider Gaussian distribution, and by what factor it is wider "
         "(default: 0.2 3)",
     )
-    locate.add_argument("--json", action="store_true", help="the answer of the HTTP interface")
+    locate.add_argument("--json", action="store_true", help="print the answer as JSON, as the HTTP interface does")
 
-    mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: angles of Silicon Labs locators in, positions out")
+    mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: read angles of Silicon Labs locators, publish positions")
     mqtt.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
     mqtt.add_argument("--broker", default="localhost", metavar="HOST[:PORT]", help="(default: localhost)")
     mqtt.add_argument(
@@ -57,12 +57,14 @@ def add_commands(add: AddCommand) -> None:
     add_output_arguments(mqtt)
     add_confidence_argument(mqtt)
     mqtt.add_argument(
-        "--window", type=float, default=0.5, help="seconds that a packet waits for more locators (default: 0.5)"
+        "--window", type=float, default=0.5, help="seconds to wait for more locators' angles of a packet (default: 0.5)"
     )
-    mqtt.add_argument("--frame", choices=("lcs", "scene", "north"), default="lcs", help="of the angles (default: lcs)")
-    mqtt.add_argument("--track", action="store_true", help="follow tags from packet to packet")
+    mqtt.add_argument(
+        "--frame", choices=("lcs", "scene", "north"), default="lcs", help="frame of the angles (default: lcs)"
+    )
+    mqtt.add_argument("--track", action="store_true", help="track tags from packet to packet")
     add_hub_argument(mqtt)
-    mqtt.add_argument("--tls", action="store_true", help="encrypt; the port is then 8883 unless given")
+    mqtt.add_argument("--tls", action="store_true", help="use TLS; the default port is then 8883")
     mqtt.add_argument(
         "--payload-kib", type=at_least_one, default=64, metavar="N", help="longest message, KiB (default: 64)"
     )
@@ -92,7 +94,7 @@ def _locate(options: argparse.Namespace) -> int:
     )
     for document in answers:
         if options.json or options.output != "native":
-            # Several are one a line, which is what programs read.
+            # Several answers are written as JSON lines.
             print(json.dumps(document, indent=2 if len(answers) == 1 else None))
         else:
             if len(answers) > 1:

@@ -11,7 +11,7 @@ _LAYERS = ("rays", "points", "mixture", "posterior", "fix")
 
 def add_commands(add: AddCommand) -> None:
     """Add the commands to the command line."""
-    view = add("view", _view, "write the viewer with a site and the fixes of a file into one HTML page")
+    view = add("view", _view, "write one HTML page with the viewer, a site, and the fixes of a file")
     view.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
     view.add_argument("report", type=Path, nargs="?", metavar="REPORT.json", help="a report, or {'reports': [...]}")
     view.add_argument("-o", "--output", type=Path, required=True, metavar="FIX.html", help="the page")
@@ -28,15 +28,15 @@ def add_commands(add: AddCommand) -> None:
         help=f"what to draw, of {','.join(_LAYERS)} (default: rays,mixture,posterior,fix)",
     )
     plot.add_argument("--truth", type=coordinate, nargs=3, metavar=("X", "Y", "Z"), help="true position, m")
-    plot.add_argument("--seed", type=seed_number, default=1, help="of rays and points (default: 1)")
+    plot.add_argument("--seed", type=seed_number, default=1, help="seed of rays and points (default: 1)")
 
 
 def _layers(text: str) -> tuple[str, ...]:
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     if not names:
-        raise argparse.ArgumentTypeError(f"{text!r} names no layer; give some of {','.join(_LAYERS)}")
+        raise argparse.ArgumentTypeError(f"{text!r} names no layer; give one or more of {','.join(_LAYERS)}")
     if unknown := [name for name in names if name not in _LAYERS]:
-        raise argparse.ArgumentTypeError(f"{unknown[0]!r} is no layer; give some of {','.join(_LAYERS)}")
+        raise argparse.ArgumentTypeError(f"{unknown[0]!r} is not a layer; give one or more of {','.join(_LAYERS)}")
     return names
 
 

@@ -23,8 +23,10 @@ def add_commands(add: AddCommand) -> None:
     serve.add_argument("tables", type=Path, metavar="T.h5|DIR", help="table, or folder of tables *.h5")
     serve.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     serve.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
-    serve.add_argument("--workers", type=int, default=1, help="processes that answer (default: 1)")
-    serve.add_argument("--log-format", choices=("text", "json"), default="text", help="of the log (default: text)")
+    serve.add_argument("--workers", type=int, default=1, help="number of worker processes (default: 1)")
+    serve.add_argument(
+        "--log-format", choices=("text", "json"), default="text", help="format of the log (default: text)"
+    )
     serve.add_argument("--access-log", action="store_true", help="log a line per request")
     serve.add_argument(
         "--track", action="store_true", help="follow targets unless a request says otherwise; with one worker"
@@ -36,13 +38,16 @@ def add_commands(add: AddCommand) -> None:
         help="let the viewer simulate reports (on a loopback address it always may)",
     )
     serve.add_argument(
-        "--api-keys", type=Path, metavar="FILE", help="keys to ask for; needed unless only this machine can reach HOST"
+        "--api-keys",
+        type=Path,
+        metavar="FILE",
+        help="file of accepted API keys; required unless HOST is a loopback address",
     )
     serve.add_argument(
         "--rate-limit",
         type=report_rate,
         metavar="N",
-        help="reports that each key may send a second (default: no limit)",
+        help="reports per second that each key may send (default: no limit)",
     )
     serve.add_argument(
         "--cors-origin",
@@ -57,41 +62,43 @@ def add_commands(add: AddCommand) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="a name by which a service without keys may be called besides localhost, e.g. that of a proxy before it; "
+        help="another host name under which a service without keys answers, e.g. that of a proxy before it; "
         "may be given several times",
     )
     serve.add_argument(
         "--root-path",
         type=web_prefix,
         metavar="PATH",
-        help="path below which a proxy offers the service, e.g. /rayfix; the proxy may take it off or not",
+        help="path prefix under which a proxy serves the service, e.g. /rayfix; the proxy may strip it or not",
     )
     serve.add_argument(
         "--trust-forwarded-prefix",
         action="store_true",
-        help="take that path from the header X-Forwarded-Prefix; only where nobody but the proxy reaches the service",
+        help="take that prefix from the header X-Forwarded-Prefix; only safe if all requests come through the proxy",
     )
     serve.add_argument(
         "--check-seconds",
         type=positive,
         default=10.0,
         metavar="S",
-        help="processor time that the check of a table may take, besides 60 s for each GB of it (default: 10)",
+        help="processor time for the check of a table, in addition to 60 s per GB (default: 10)",
     )
     serve.add_argument(
         "--check-memory-mb",
         type=positive,
         default=256.0,
         metavar="MB",
-        help="memory that the check of a table may take, besides three times its size (default: 256)",
+        help="memory for the check of a table, in addition to three times its size (default: 256)",
     )
     add_service_broker_arguments(serve)
     _add_limit_arguments(serve)
     _add_message_arguments(serve)
 
     api_key = add("api-key", _api_key, "make an API key, print it once, and add its hash to a key file")
-    api_key.add_argument("name", metavar="NAME", help="whose it is")
-    api_key.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="key file, made if need be")
+    api_key.add_argument("name", metavar="NAME", help="name of the key's owner")
+    api_key.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="key file, created if necessary"
+    )
 
 
 def _add_limit_arguments(command: argparse.ArgumentParser) -> None:
@@ -123,7 +130,7 @@ _MESSAGES = (
     ("message-values", 50_000, "values of a message of another format"),
     ("message-results", 1024, "measurements of an NRPPa message"),
     ("message-stations", 1024, "names in a message's map of stations"),
-    ("batch-rest-kib", 64, "of a batch beside its reports, KiB"),
+    ("batch-rest-kib", 64, "content of a batch besides its reports, KiB"),
     ("listed-errors", 50, "offending fields that a problem lists"),
     ("body-kib", 1024, "longest body of a request, KiB"),
     ("batch-kib", 16384, "longest body of a batch, KiB"),

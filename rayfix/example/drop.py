@@ -1,4 +1,4 @@
-"""A UE in the bundled hall that one station sees and three hear by reflection: its position and its report."""
+"""A UE in the bundled hall with line of sight to one station and reflected paths to three: its position and report."""
 
 import json
 from typing import Any
@@ -24,7 +24,7 @@ def example_paths() -> dict[str, Paths]:
 
 
 def simulate_example_report(paths: dict[str, Paths], *, seed: int = 1) -> dict[str, Any]:
-    """Report of the strongest path to each station, with noise; seed 1 gives the bundled one."""
+    """Report of the strongest path to each station, with noise; seed 1 gives the bundled report."""
     return simulate_report(
         paths,
         EXAMPLE_NOISE,
@@ -36,7 +36,7 @@ def simulate_example_report(paths: dict[str, Paths], *, seed: int = 1) -> dict[s
 
 
 def report_text(report: dict[str, Any]) -> str:
-    """JSON of a report, numbers rounded to what a sensor would give."""
+    """JSON of a report, with numbers rounded as a sensor would."""
 
     def rounded(value: Any) -> Any:
         return round(value, 3) if isinstance(value, float) else value

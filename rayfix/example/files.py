@@ -1,4 +1,4 @@
-"""Write the bundled example as the files that a user would start from."""
+"""Write the files of the bundled example."""
 
 from importlib import resources
 from pathlib import Path
@@ -34,7 +34,7 @@ def write_example(folder: str | Path, *, windows_deg: tuple[float, ...] = (1.25,
         folder.mkdir(parents=True, exist_ok=True)
         for path, content in files.items():
             if path.exists() and path.read_bytes() != content:
-                raise RayfixError(f"{path} exists and is not the example's; choose another folder, or remove it first")
+                raise RayfixError(f"{path} exists and is not from the example; choose another folder, or remove it")
         for path, content in files.items():
             path.write_bytes(content)
     except OSError as error:

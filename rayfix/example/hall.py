@@ -50,7 +50,7 @@ def hall_boxes() -> list[Box]:
     ]
     for i, ((x0, y0), (x1, y1), height) in enumerate(machines, start=1):
         boxes.append(Box(name=f"machine_{i}", material="metal", low=(x0, y0, 0.0), high=(x1, y1, height)))
-        # Each machine has its control cabinet at its side.
+        # Each machine has a control cabinet at its side.
         boxes.append(
             Box(
                 name=f"cabinet_{i}",

@@ -1,8 +1,7 @@
-"""Tables from files that need not be whole: checked in a process of its own before this one maps them.
+"""Tables from files that may be damaged: a separate process checks them before this one maps them.
 
-A damaged file can crash the HDF5 library, hold it for ever, or have it take any amount of memory. The check runs within
-limits, in a process that has nothing else to lose. It tells where the arrays lie; this process reads them from the
-mapped file and never gives the file to HDF5.
+A damaged file can make the HDF5 library crash, hang or use any amount of memory. The check runs with limits in a
+separate process and returns the offsets of the arrays. This process reads them from the mapped file, without HDF5.
 """
 
 import json
@@ -24,33 +23,33 @@ from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATabl
 from rayfix_tables.table import Table
 
 VERDICTS = (CorruptTableError, FormatVersionError, NotATableError)
-"""Errors that hold for a version of a file for good; any other may be over at the next try."""
+"""Errors that are permanent for a version of a file; any other may not occur at the next attempt."""
 
 _START = f"""\
 import sys
 sys.path[:] = sys.argv.pop(1).split({os.pathsep!r})
 from rayfix_tables.checking import main
 main(sys.argv[1:])
-"""  # finds what this process finds, wherever that comes from
+"""  # the same import path as in this process
 _NO_THREADS = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 _REMEDY = "restore it from a copy or build it again"
-_LOOK_SECONDS = 0.1  # between two looks at whether a check was called off
-_OWN_SECONDS = 1  # of the check's own start
-_PATIENCE = 20  # times the processor time: a busy machine has other work, too
+_LOOK_SECONDS = 0.1  # between two tests whether a check was cancelled
+_OWN_SECONDS = 1  # for the start of the check's process
+_PATIENCE = 20  # wall-clock limit divided by that of processor time: a machine can be busy
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckLimits:
-    """What the check of a table may take.
+    """Limits of the check of a table.
 
     Attributes
     ----------
     seconds : float
         Processor time for any table.
     seconds_per_gigabyte : float
-        Processor time besides for each 10^9 bytes of the file.
+        Additional processor time for each 10^9 bytes of the file.
     memory : int
-        Memory, bytes, besides three times the file's size, of which the file itself is one.
+        Memory, bytes, in addition to three times the file's size, which includes the file itself.
     """
 
     seconds: float = 10.0
@@ -70,13 +69,13 @@ _DEFAULT_LIMITS = CheckLimits()
 
 
 def open_checked(path: str | Path, *, whole: bool = True, limits: CheckLimits | None = None) -> Table:
-    """Map a table file that was checked in a process of its own.
+    """Check a table file in a separate process, and map it.
 
     Parameters
     ----------
     path : str or Path
     whole : bool
-        Whether to read every byte and compare the checksums, and not only to read what the table holds.
+        Whether to read every byte and compare the checksums, instead of only reading the metadata and small arrays.
     limits : CheckLimits, optional
 
     Raises
@@ -88,19 +87,19 @@ def open_checked(path: str | Path, *, whole: bool = True, limits: CheckLimits | 
     FormatVersionError
         When another version of rayfix wrote it.
     CorruptTableError
-        When it is damaged, or reading it crashes, takes too long or too much memory.
+        When it is damaged, or reading it crashes or exceeds a limit.
     """
     with open_table_file(Path(path)) as opened:
         return table_of_verdict(opened, check_file(opened, whole=whole, limits=limits or _DEFAULT_LIMITS))
 
 
 def table_of_verdict(opened: OpenFile, verdict: Mapping[str, Any]) -> Table:
-    """Make the table of a file from what :func:`check_file` found.
+    """Make the table of a file from the result of :func:`check_file`.
 
     Raises
     ------
     TableError
-        When it was refused.
+        When the check refused it.
     """
     if "error" in verdict:
         raise getattr(errors, verdict["error"])(verdict["message"])
@@ -111,7 +110,7 @@ def table_of_verdict(opened: OpenFile, verdict: Mapping[str, Any]) -> Table:
 def check_file(
     opened: OpenFile, *, whole: bool, limits: CheckLimits, given_up: threading.Event | None = None
 ) -> dict[str, Any]:
-    """Check a file in a process of its own.
+    """Check a file in a separate process.
 
     Parameters
     ----------
@@ -146,7 +145,7 @@ def check_file(
     except OSError as error:
         raise TableError(f"{opened.path} cannot be checked now ({error.strerror}); try again") from error
     if not opened.unchanged:
-        raise TableError(f"{opened.path} changed while it was read; write tables beside and rename them into place")
+        raise TableError(f"{opened.path} changed while it was read; write a table under another name and rename it")
     if process.returncode == -signal.SIGKILL:
         why = f"it took more than {patience} s, or was ended from outside"
         raise TableError(f"{opened.path} cannot be checked now ({why}); try again when the machine is less busy")
@@ -154,7 +153,7 @@ def check_file(
 
 
 def _wait(process: subprocess.Popen[bytes], seconds: float, given_up: threading.Event | None) -> tuple[bytes, bytes]:
-    """Wait for the check to end, and end it after that time."""
+    """Wait for the check, and end it after the time limit."""
     deadline = time.monotonic() + seconds
     while True:
         try:
@@ -162,7 +161,7 @@ def _wait(process: subprocess.Popen[bytes], seconds: float, given_up: threading.
         except subprocess.TimeoutExpired:
             if time.monotonic() > deadline or (given_up is not None and given_up.is_set()):
                 process.kill()
-        except BaseException:  # Ctrl-C must not leave it behind
+        except BaseException:  # Ctrl-C must also end the check
             process.kill()
             raise
 

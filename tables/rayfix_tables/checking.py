@@ -1,8 +1,8 @@
-"""The check of a table file, as a program of its own.
+"""The check of a table file, as a separate program.
 
-A damaged file can crash HDF5 or hold it for ever, so that whoever must not crash or wait has it read here: see
-:mod:`rayfix_tables.checked`, which starts this. The file is the program's standard input, open for reading; PATH is its
-name in messages. Its layout, or why it is refused, is the program's output, as JSON.
+A damaged file can make HDF5 crash or hang. Processes that must not crash or hang let this program read it;
+:mod:`rayfix_tables.checked` starts it. The open file is the program's standard input; PATH is its name in messages. The
+output is JSON: the layout of the file, or why it is refused.
 """
 
 import json
@@ -35,11 +35,11 @@ def main(arguments: list[str]) -> None:
         text = json.dumps({"error": type(error).__name__, "message": str(error)})
     sys.stdout.write(text)
     sys.stdout.flush()
-    os._exit(0)  # what HDF5 would do at the end is no concern of anybody's
+    os._exit(0)  # skips HDF5's cleanup at exit, which may fail on a damaged file
 
 
 def check(opened: OpenFile, *, whole: bool) -> dict[str, Any]:
-    """Read the layout of a table and check what it says; returns the layout's document.
+    """Read and check the layout of a table; returns the layout's document.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def check(opened: OpenFile, *, whole: bool) -> dict[str, Any]:
     Raises
     ------
     TableError
-        When the file is no whole table.
+        When the file is not an intact table.
     """
     with damage_reported(opened.path):
         layout = read_layout(opened)
@@ -60,7 +60,7 @@ def check(opened: OpenFile, *, whole: bool) -> dict[str, Any]:
 
 
 def limit_this_process(*, seconds: int, memory: int) -> None:
-    """Let this process take no more than so much processor time [s] and so much more memory [bytes]; write no file."""
+    """Limit this process's processor time [s] and additional memory [bytes], and forbid it to write files."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     address_space = pages * resource.getpagesize() + memory
     resource.setrlimit(resource.RLIMIT_AS, (address_space, address_space))

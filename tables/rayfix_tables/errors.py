@@ -1,8 +1,8 @@
-"""The errors that the table and both halves raise on purpose; ``rayfix.errors`` draws all of them.
+"""The errors that the table and both halves raise on purpose; ``rayfix.errors`` lists all of them.
 
 ::
 
-    RayfixError                 root; ``str(error)`` is one line that names the culprit and the remedy
+    RayfixError                 root; ``str(error)`` is one line that names the cause and the remedy
     ├── SiteError               the site file: unreadable, unknown key, value out of range
     ├── SceneError              the mesh: missing, unreadable, empty, a station where none can be
     ├── BuildError              the offline job: no space left, no ray came back

@@ -1,4 +1,4 @@
-"""Where a UE can be at all: a voxel map of the building's free space."""
+"""The positions where a UE can be: a voxel map of the building's free space."""
 
 from dataclasses import dataclass, replace
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, kw_only=True)
 class FreeSpace:
-    """Voxels in which a UE can be.
+    """The voxels in which a UE can be.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class FreeSpace:
         return float(np.count_nonzero(self.free)) * self.voxel_size**3
 
     def moved(self, by: NDArray[np.float64]) -> "FreeSpace":
-        """Return the same map elsewhere, moved by a vector of shape (3,), m."""
+        """Return the map translated by a vector of shape (3,), m."""
         return replace(self, origin=self.origin + by) if np.any(by) else self
 
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ from rayfix_tables.geometry.angles import wrap
 
 @dataclass(frozen=True, kw_only=True)
 class AngularGrid:
-    """Cells of directions; cell 0 is at the zenith's ring and the start of its azimuths, the last at the nadir's.
+    """Cells of directions, ring by ring from the zenith to the nadir, in each ring by azimuth from -pi.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class AngularGrid:
     def cell_around(self, azimuth: float, zenith: float) -> tuple[int, float, float]:
         """Cell that holds one direction, and the azimuth and zenith of its centre, rad.
 
-        The same as :meth:`nearest` and :attr:`centres`, without arrays: a report looks up a few directions only.
+        Scalar version of :meth:`nearest` and :attr:`centres`, because a report looks up only a few directions.
         """
         ring = min(max(int(zenith * self.num_rings / math.pi), 0), self.num_rings - 1)
         cells = int(self.ring_cells[ring])

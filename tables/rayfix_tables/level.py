@@ -11,10 +11,10 @@ from rayfix_tables.grid import AngularGrid
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 
 WINDOW_RATIO = 1.25
-"""A window's standard deviation is at least this times that of a measurement it serves."""
+"""A window's standard deviation is at least this times that of the measurements that it is used for."""
 
 UNBALANCED: NDArray[np.float32] = np.zeros(0, np.float32)
-"""The ``log_balance`` of a level that is not balanced; read-only like a mapped one, for which kernels are compiled."""
+"""``log_balance`` of a level without one; read-only, like the mapped arrays that kernels are compiled for."""
 UNBALANCED.flags.writeable = False
 
 
@@ -33,8 +33,8 @@ class Level:
     mixture : TubeMixture
         Components of all cells.
     log_balance : ndarray of shape (n_components,) or (0,)
-        Added to the components' ``log_weight`` where places are compared: at each place, the probabilities of its paths
-        then add up to 1, as far as Gaussians can. Without entries where the level is not balanced.
+        Added to the components' ``log_weight`` when positions are compared. The probabilities of the paths to each
+        position then add up to 1, as closely as Gaussians permit. Empty if the level is not balanced.
     """
 
     window: float
@@ -55,7 +55,7 @@ class Level:
         return len(self.mixture)
 
     def ranges(self, most: int) -> Iterator[tuple[int, int]]:
-        """Cut the cells into ranges, from the first to before the last, of ``most`` components or of one cell."""
+        """Split the cells into ranges (first, stop) of at most ``most`` components, or of one cell."""
         first = 0
         while first < self.num_cells:
             begin = int(self.cell_offsets[first])

@@ -7,10 +7,10 @@ plane, and a map from u to the position x. With d = u - u_mean::
     x | u ~ N(x_mean + jacobian d + widening, x_cov)
     widening = jacobian_a (d_L d_a - u_cov_La) / L_mean
 
-A step of the angle moves the far end of a tube further than its near end, in proportion to the path length. That is the
-widening, whose mean is zero. It needs no numbers of its own: the last two columns of the jacobian are its slopes at the
-mean length. Without it, a component's x_cov would have to hold the slant that its rays take away from its middle, and
-angles much finer than the window would be believed less than they deserve.
+A change of the angle moves the far end of a tube further than its near end, in proportion to the path length. This is
+the widening; its mean is zero. It needs no parameters: the last two columns of the jacobian are its slopes at the mean
+length. Without it, a component's x_cov would have to include the spread of its rays' directions, and angles much more
+accurate than the window would be under-weighted.
 """
 
 from collections.abc import Sequence
@@ -48,14 +48,14 @@ def pack(matrices: NDArray[Any]) -> NDArray[Any]:
 
 
 def unpack(packed: NDArray[Any]) -> NDArray[Any]:
-    """Unpack what :func:`pack` packed."""
+    """Unpack the result of :func:`pack`."""
     return packed[..., _UNPACK]
 
 
 def widening_cov(u_mean: NDArray[Any], u_cov: NDArray[Any], jacobian: NDArray[Any]) -> NDArray[np.float64]:
     """Covariance that the widening adds to the position of components.
 
-    Of Gaussian d_L and d_a, ``cov(d_L d_a) = cov_LL cov_aa + cov_La cov_aL``. The widening is not correlated with u.
+    For Gaussian d_L and d_a, ``cov(d_L d_a) = cov_LL cov_aa + cov_La cov_aL``. The widening is uncorrelated with u.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def widening_cov(u_mean: NDArray[Any], u_cov: NDArray[Any], jacobian: NDArray[An
 
 
 class Tubes(NamedTuple):
-    """The arrays of a :class:`TubeMixture` that kernels take, which know no dataclass."""
+    """The arrays of a :class:`TubeMixture` for kernels, which cannot take dataclasses."""
 
     log_weight: NDArray[Any]
     u_mean: NDArray[Any]
@@ -101,7 +101,7 @@ class TubeMixture:
     jacobian : ndarray of shape (n, 3, 3)
         dx / du.
     x_cov : ndarray of shape (n, 6), m2
-        Packed covariance of x given u, around the tube with its widening.
+        Packed covariance of x given u, in addition to the widening.
     num_reflections : ndarray of int8, shape (n,)
         Reflections of the path that carries most of the component.
     """
@@ -124,7 +124,7 @@ class TubeMixture:
         return Tubes(self.log_weight, self.u_mean, self.u_cov, self.x_mean, self.jacobian, self.x_cov)
 
     def __getitem__(self, index: slice | NDArray[np.int64]) -> "TubeMixture":
-        """Components of a range, without a copy, or those of the given numbers."""
+        """Components of a slice, without a copy, or of an index array."""
         return TubeMixture(**{name: getattr(self, name)[index] for name in FIELD_SHAPES})
 
     @classmethod
@@ -134,7 +134,7 @@ class TubeMixture:
 
     @classmethod
     def concatenate(cls, parts: Sequence["TubeMixture"]) -> "TubeMixture":
-        """Components of all parts, in their order."""
+        """Concatenate the components of all parts."""
         if not parts:
             return cls.empty()
         return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)})

@@ -11,19 +11,19 @@ from rayfix_tables.site import Station
 
 @dataclass(frozen=True, kw_only=True)
 class Update:
-    """Where an updated part comes from. A part without one is what a whole build makes, to the last bit.
+    """Origin of an updated part. A part without this is bit-identical to that of a new build.
 
     Attributes
     ----------
     exact_part_id : str
-        ``part_id`` that a whole build would have given.
+        ``part_id`` of the part of a new build.
     former_part_id : str
-        ``part_id`` of the part that cells were kept from.
+        ``part_id`` of the part from which cells were kept.
     tolerance : float
         Largest change for which a cell was kept.
     cell_change : tuple of ndarray of float32, shape (n_cells,)
-        By level: by how much of its mass the measure that the cell was fitted to differs at most from the one that it
-        would be fitted to now; 0 where the cell is that of a whole build.
+        For each level: bound on the difference between the measure that a cell was fitted to and the present one, as a
+        fraction of its mass; 0 if the cell is that of a new build.
     """
 
     exact_part_id: str
@@ -38,7 +38,7 @@ class Update:
 
     @property
     def num_changed(self) -> int:
-        """Number of cells that differ from those of a whole build."""
+        """Number of cells that differ from those of a new build."""
         return sum(int(np.count_nonzero(change)) for change in self.cell_change)
 
 
@@ -51,13 +51,14 @@ class StationPart:
     levels : tuple of Level
         Finest first.
     lost_ray_share : float
-        Share of the launched rays that left the scene without having come to their last reflection.
+        Fraction of the launched rays that left the scene before their last reflection.
     coverage : tuple of float
-        Share of the free space that is reached with at most 0, 1, 2, ... reflections.
+        Fraction of the free space that is reached with at most 0, 1, 2, ... reflections.
     part_id : str
-        Names all that decided the part's content, so that a later build can tell whether it is still right.
+        Hash of everything that determines the part's content; a later build compares it to decide whether to reuse the
+        part.
     update : Update, optional
-        Of a part with cells that a whole build would have made slightly differently.
+        For a part with cells that a new build would fit slightly differently.
     """
 
     station: Station

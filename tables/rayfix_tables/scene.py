@@ -21,10 +21,10 @@ class Scene:
         Index into ``materials``; -1 for none.
     free_space : FreeSpace
     sha256 : str
-        Of the geometry and its materials, in the table's frame.
+        Checksum of the geometry and its materials, in the table's frame.
     origin : ndarray of shape (3,), m
-        Of the table's frame in the scene's: components count positions from there, as all does in the file. It is zero
-        but for scenes on map coordinates, of which single precision would know no more than decimetres.
+        Origin of the table's frame in the scene frame; all positions in the file are relative to it. It is zero except
+        for scenes on map coordinates, which single precision would resolve to decimetres only.
     """
 
     vertices: NDArray[np.float64]
@@ -36,7 +36,7 @@ class Scene:
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     def moved(self, by: NDArray[np.float64]) -> "Scene":
-        """Return the same scene elsewhere, moved by a vector of shape (3,), m; the table's frame moves along."""
+        """Return the scene translated by a vector of shape (3,), m, together with the table's frame."""
         if not np.any(by):
             return self
         return replace(self, vertices=self.vertices + by, free_space=self.free_space.moved(by), origin=self.origin + by)
@@ -48,5 +48,5 @@ class Scene:
 
     @cached_property
     def in_table_frame(self) -> "Scene":
-        """The same scene in the table's frame, in which components have their positions."""
+        """The scene in the table's frame, which is also that of the components' positions."""
         return self.moved(-self.origin)

@@ -1,4 +1,4 @@
-"""What a table knows of its site: stations, north, and the settings it was built with."""
+"""The site as stored in a table: stations, north, and the settings of the build."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -14,16 +14,17 @@ Mounting = Literal["3gpp", "silabs", "ublox"]
 
 @dataclass(frozen=True, kw_only=True)
 class StationBias:
-    """What a station measures wrongly each time: measured minus true. The fusion takes it off; the table holds for any.
+    """Systematic error of a station: measured minus true. The fusion subtracts it; the table does not depend on it.
 
     Attributes
     ----------
     range, range_stdev : float, m
-        Of times as lengths (propagation times, times of arrival and their differences), and how uncertain it is.
+        Bias of times as lengths (propagation times, times of arrival and their differences), and its standard
+        deviation.
     azimuth, zenith : float, rad
-        Of the angles, in the frame in which the station reports them.
+        Biases of the angles, in the frame in which the station reports them.
     angle_stdev : float, rad
-        How uncertain either of these two is.
+        Standard deviation of each of these two.
     """
 
     range: float = 0.0
@@ -45,7 +46,7 @@ class Station:
     position : tuple of 3 floats, m
         In the scene frame.
     orientation : tuple of 3 floats, rad
-        Bearing, downtilt and slant, as in 3GPP TR 38.901; they turn the scene frame into the station's local one.
+        Bearing, downtilt and slant, as in 3GPP TR 38.901; they rotate the scene frame into the station's local one.
     field_of_view : float, rad
         Full opening angle of the cone around the station's boresight in which it measures.
     bias : StationBias
@@ -61,21 +62,21 @@ class Station:
     mounting: Mounting = "3gpp"
 
     def moved(self, by: NDArray[np.float64]) -> "Station":
-        """Return the same station elsewhere, moved by a vector of shape (3,), m."""
+        """Return the station translated by a vector of shape (3,), m."""
         x, y, z = (np.asarray(self.position) + by).tolist()
         return replace(self, position=(x, y, z))
 
 
 @dataclass(frozen=True, kw_only=True)
 class SiteInfo:
-    """The site as the table carries it.
+    """The site as stored in a table.
 
     Attributes
     ----------
     north : float, rad
         Azimuth of geographic north in the scene frame.
     max_path_length : float, m
-        Longest unfolded path in the table.
+        Largest unfolded path length in the table.
     document : dict
         The whole site file, validated, as JSON-compatible data.
     """

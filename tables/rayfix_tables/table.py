@@ -41,7 +41,7 @@ class Table:
     parts : dict of str to StationPart
         By station identifier, in the site's order.
     layout : FileLayout
-        Of the file: with the arrays, what the ``table_id`` is made of.
+        Layout of the file. The ``table_id`` is computed from it and the arrays.
     mapped : ndarray of uint8
         Bytes of the file.
     """
@@ -57,17 +57,16 @@ class Table:
     mapped: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8), repr=False, compare=False)
 
     def __repr__(self) -> str:
-        """Name the table; its arrays would fill the screen."""
+        """Describe the table without its arrays."""
         return f"Table({str(self.path)!r}, site {self.site.name!r}, {len(self.parts)} stations, {self.table_id[:12]})"
 
     @classmethod
     def open(cls, path: str | Path) -> "Table":
         """Map a table file.
 
-        Checks the format, that the file is whole, and that its numbers can be computed with; :meth:`verify` also
-        compares the checksums. HDF5 reads the file in this process, which a damaged one can crash or hold for ever:
-        for a file from elsewhere take :func:`rayfix_tables.checked.open_checked`, which has it checked in a process of
-        its own.
+        Checks the format, completeness, and that numbers are finite and indices within range; :meth:`verify` also
+        compares the checksums. HDF5 reads the file in this process, and a damaged file can make it crash or hang: for
+        an untrusted file use :func:`rayfix_tables.checked.open_checked`, which checks it in a separate process.
 
         Raises
         ------
@@ -78,7 +77,7 @@ class Table:
         FormatVersionError
             When another version of rayfix wrote it.
         CorruptTableError
-            When it is truncated or a part is missing.
+            When it is truncated, or a part of it is missing.
         """
         path = Path(path)
         with open_table_file(path) as opened, damage_reported(path):
@@ -88,17 +87,17 @@ class Table:
 
     @classmethod
     def of_layout(cls, path: Path, layout: FileLayout, mapped: NDArray[np.uint8]) -> "Table":
-        """Make the table of a mapped file whose layout is known, without HDF5. Call it within ``damage_reported``.
+        """Make the table of a mapped file from its layout, without HDF5. Call it within ``damage_reported``.
 
         Raises
         ------
         KeyError, ValueError
-            When a part is missing or does not fit the others.
+            When a part is missing or inconsistent with others.
         """
         root = layout.attributes[""]
         site_document = _read_json(layout, mapped, "site")
         if not isinstance(site_document, dict):
-            raise ValueError("site is no JSON object")
+            raise ValueError("site is not a JSON object")
         scene = _read_scene(layout, mapped)
         station_ids = site_document["station_ids"]
         _check_members(layout, station_ids)
@@ -144,7 +143,7 @@ class Table:
 
     @cached_property
     def in_table_frame(self) -> "Table":
-        """The same table with its scene and stations in the frame of its components: fixes are in that frame, too."""
+        """The table with scene and stations in the frame of its components; its fixes are in that frame too."""
         if not self.scene.origin.any():
             return self
         stations = tuple(station.moved(-self.scene.origin) for station in self.site.stations)
@@ -160,12 +159,12 @@ class Table:
         return self.parts[station_id].levels
 
     def arrays(self) -> Iterator[tuple[str, NDArray[Any]]]:
-        """Arrays of the table as they are in the file, by the paths of their datasets."""
+        """Arrays of the table as stored in the file, by path of the dataset."""
         for path in self.layout.datasets:
             yield path, self.layout.array(path, self.mapped)
 
     def verify(self) -> None:
-        """Read every byte and compare the checksums, in the file as it was opened.
+        """Read every byte of the file that was opened, and compare the checksums.
 
         Raises
         ------
@@ -184,15 +183,15 @@ class Table:
 
 
 def _check_members(layout: FileLayout, station_ids: Any) -> None:
-    """Check that the file has the stations that the site names, and no other group or dataset than theirs."""
+    """Check that the file has exactly the stations of the site, and no other group or dataset."""
     named = isinstance(station_ids, list) and all(isinstance(each, str) for each in station_ids)
     if not named or not station_ids or len(set(station_ids)) < len(station_ids):
-        raise ValueError("station_ids are no list of different stations")
+        raise ValueError("station_ids are not a list of different stations")
     known = {f"stations/{station_id}" for station_id in station_ids}
     for path in layout.attributes:
         station = "/".join(path.split("/")[:2])
         if path.startswith("stations/") and station not in known:
-            raise ValueError(f"{station} is no station of the site")
+            raise ValueError(f"{station} is not a station of the site")
 
 
 def _level_paths(layout: FileLayout, station_id: str) -> list[str]:
@@ -257,7 +256,7 @@ def _read_scene(layout: FileLayout, mapped: NDArray[np.uint8]) -> Scene:
     face_materials, free = arrays["scene/face_materials"], arrays["scene/free_space"]
     materials = _read_json(layout, mapped, "scene/materials")
     if not isinstance(materials, list):
-        raise ValueError("materials are no list")
+        raise ValueError("materials are not a list")
     for name, array in (("scene/vertices_m", vertices), ("scene/faces", faces)):
         if array.shape[1] != 3:
             raise ValueError(f"{name} has the shape {array.shape}, not (n, 3)")
@@ -284,18 +283,18 @@ def _read_scene(layout: FileLayout, mapped: NDArray[np.uint8]) -> Scene:
 
 
 def _read_json(layout: FileLayout, mapped: NDArray[np.uint8], path: str) -> Any:
-    """Read what is a dataset of text, and was an attribute of the group above in version 1."""
+    """Read a dataset of text, which in version 1 was an attribute of the group."""
     if path in layout.datasets:
         try:
             return json.loads(layout.array(path, mapped).tobytes())
         except ValueError as error:
-            raise ValueError(f"{path} is no JSON: {error}") from error
+            raise ValueError(f"{path} is not JSON: {error}") from error
     group, _, name = path.rpartition("/")
     return json.loads(_text(layout.attributes[group][name]))
 
 
 def _text(value: Any) -> str:
-    """Text that can be written into answers."""
+    """Check that a value is text, which can be written into answers."""
     if not isinstance(value, str):
         raise ValueError(f"{type(value).__name__} where there should be text")
     value.encode("utf-8")

@@ -1,4 +1,4 @@
-"""Write table files: beside the final name, checksummed, synced, then renamed into place."""
+"""Write table files: under a temporary name, with checksums, synced, then renamed to the final name."""
 
 import contextlib
 import io
@@ -35,14 +35,14 @@ from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
 
 _LIBVER = ("v108", "v108")
-"""Of HDF5's own structures: those since 1.8 have checksums, so that a damaged one is found and not followed."""
+"""Version of HDF5's own structures: since 1.8 they have checksums, and damage is detected."""
 
 _LOOKS, _LOOK_SECONDS = 5, 0.05
-"""At a lock: another build holds one for a moment when it renames its table into place."""
+"""Attempts at a lock, which another build holds briefly while it renames its table."""
 
 
 def check_folder(path: Path, error: type[RayfixError]) -> None:
-    """Raise an error of a kind when the folder of a file to come is missing or read-only."""
+    """Raise an error of the given class if the folder of a new file is missing or read-only."""
     if not path.parent.is_dir():
         raise error(f"cannot write {path}: there is no folder {path.parent}; create it first")
     if not os.access(path.parent, os.W_OK):
@@ -50,7 +50,7 @@ def check_folder(path: Path, error: type[RayfixError]) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Fail before the work is done rather than after.
+    """Check before the work that a table can be written.
 
     Raises
     ------
@@ -63,8 +63,8 @@ def check_writable(path: Path) -> None:
     if (what := why_not_regular(path)) is not None:
         raise TableError(f"cannot write {path}: it {what}; give another name, or remove it first")
     if path.exists() and path.stat().st_size and not _is_hdf5(path):
-        # A site file or a scene by a slip of the hand: only a table gives way to a table.
-        raise TableError(f"cannot write {path}: the file there is no table; give another name, or remove it first")
+        # A table may only replace a table, not, by mistake, a site file or a scene.
+        raise TableError(f"cannot write {path}: the file there is not a table; give another name, or remove it first")
     if path.exists() and _is_being_written(path):
         raise TableError(
             f"cannot write {path}: another program has locked it to write to it; end that, or give another name"
@@ -72,7 +72,7 @@ def check_writable(path: Path) -> None:
 
 
 def _is_being_written(path: Path) -> bool:
-    """Whether a program holds the lock of a writer on a file, as HDF5 takes it. Readers may go on with the old file."""
+    """Whether a program holds HDF5's writer lock on a file. Readers may continue with the old file."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
@@ -103,19 +103,19 @@ def write_table(
 ) -> str:
     """Write a table file and return its ``table_id``.
 
-    Nothing appears under ``path`` until the whole table is on disk; whatever was there before stays until then.
+    ``path`` is replaced only when the whole table is on disk; a former file there remains until then.
 
     Parameters
     ----------
     parts : sequence of StationPart
-        Of ``site.stations``, in their order.
+        Parts of ``site.stations``, in the same order.
     progress : callable, optional
-        Called with the number of bytes that are written, and with that of all.
+        Called with the number of bytes written so far, and the total.
 
     Raises
     ------
     ValueError
-        When the parts are of other stations.
+        When the parts belong to other stations.
     TableError
         When the disk is full or the folder cannot be written; no partial file is left.
     """
@@ -132,7 +132,7 @@ def write_table(
             finally:
                 sink.raise_failure()
             os.fsync(sink.fileno())
-            partial.replace(path)  # while it is still known to be in use
+            partial.replace(path)  # while the lock still marks it as in use
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
@@ -150,16 +150,16 @@ def write_table(
 
 
 class _Sink(io.FileIO):
-    """File whose writes never fail as HDF5 sees it.
+    """File object that hides failures of writes from HDF5.
 
-    HDF5 crashes the process, or prints tracebacks when it ends, after a write that failed (a full disk). So the first
-    failure, or Ctrl-C, is kept, nothing more is written, and the failure is raised when HDF5 is done.
+    After a failed write (a full disk), HDF5 crashes the process or prints tracebacks at exit. Therefore the first
+    failure, or Ctrl-C, is stored, nothing more is written, and the failure is raised after HDF5 has finished.
     """
 
     _failure: BaseException | None = None
 
     def write(self, data: Any, /) -> int:
-        """Write all of it."""
+        """Write all bytes."""
         rest = memoryview(data).cast("B")
         size = len(rest)
         try:
@@ -179,7 +179,7 @@ class _Sink(io.FileIO):
         return size or 0
 
     def raise_failure(self) -> None:
-        """Raise the first failure."""
+        """Raise the first failure, if there was one."""
         if self._failure is not None:
             raise self._failure
 
@@ -215,7 +215,7 @@ def _write_part(file: h5py.File, part: StationPart, origin: NDArray[np.float64])
     group.attrs["position_m"] = np.asarray(station.position) - origin
     group.attrs["orientation_deg"] = np.rad2deg(station.orientation)
     group.attrs["field_of_view_deg"] = float(np.rad2deg(station.field_of_view))
-    if station.mounting != Station.mounting:  # or tables of older versions would change
+    if station.mounting != Station.mounting:  # otherwise the table_id of older tables would change
         write_text(group, "mounting", station.mounting)
     for name, value in bias_attributes(station.bias).items():
         group.attrs[name] = value
@@ -283,7 +283,7 @@ def _site_document(site: SiteInfo) -> dict[str, Any]:
 
 
 def _first_line(error: BaseException) -> str:
-    """Say in one line what HDF5 says in several."""
+    """Shorten HDF5's message to one line."""
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
     return str(error).splitlines()[0] if str(error) else type(error).__name__

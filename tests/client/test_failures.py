@@ -166,7 +166,7 @@ def test_retry_after_is_seconds_or_a_date():
 @pytest.mark.parametrize("body", [b"<html>hello</html>", b"[]", b"{}", b'{"status": "ok"}', b"null"])
 def test_an_answer_of_something_else_is_called_so(body: bytes):
     for status in (200, 418):
-        with pytest.raises(AnswerError, match="is the address right"):
+        with pytest.raises(AnswerError, match="check the address"):
             Flaky(httpx.Response(status, content=body)).client().locate(REPORT)
     with pytest.raises(AnswerError):
         Flaky(httpx.Response(200, content=body)).client().locate_batch([REPORT])

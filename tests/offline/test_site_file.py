@@ -79,7 +79,7 @@ def test_an_array_is_turned_in_one_way(site_document: Document, key: str) -> Non
     document = site_document()
     document["stations"][0] |= {"orientation_deg": [90, 0, 120], key: 0.0}
     assert refused(document).startswith(
-        f"stations[0]: orientation_deg and {key} both say how the array is turned; give"
+        f"stations[0]: orientation_deg and {key} both state the orientation of the array; give"
     )
 
 

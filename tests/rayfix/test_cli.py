@@ -140,7 +140,7 @@ def test_locate_takes_and_gives_other_formats(
     assert "give the station in the map stations" in err
     status, _, err = run(capsys, *command, "--station", "A1")
     assert status == 2
-    assert "station 'A1' is no pair; give NAME=STATION" in one_line(err)
+    assert "station 'A1' is not a pair; give NAME=STATION" in one_line(err)
 
 
 def test_the_example_spares_what_is_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -152,7 +152,7 @@ def test_the_example_spares_what_is_there(capsys: pytest.CaptureFixture[str], tm
     (tmp_path / "report.json").unlink()
     status, out, err = run(capsys, "example", tmp_path)
     assert (status, out) == (2, "")
-    assert "site.toml exists and is not the example's; choose another folder" in one_line(err)
+    assert "site.toml exists and is not from the example; choose another folder" in one_line(err)
     assert site.read_text(encoding="utf-8") == "# days of work"
     assert not (tmp_path / "report.json").exists()
     assert (tmp_path / "hall.glb").read_bytes() == files["hall.glb"]
@@ -178,7 +178,7 @@ def test_an_updated_table_says_so(capsys: pytest.CaptureFixture[str], tmp_path: 
     assert (status, err) == (0, "")
     assert re.search(r"bs1: \d+ of \d+ finest cells kept, changed by at most \d\.\d\d%", out)
     out = run(capsys, "info", table)[1]
-    assert re.search(r"bs1: [\d,]+ of [\d,]+ cells differ from those of a whole build, by at most \d\.\d\d% ", out)
+    assert re.search(r"bs1: [\d,]+ of [\d,]+ cells differ from those of a new build, by at most \d\.\d\d% ", out)
     assert "(tolerance 5.00%); build without --tolerance to make it exact" in out
     facts = json.loads(run(capsys, "info", table, "--json")[1])
     for station in facts["stations"]:
@@ -210,33 +210,45 @@ def test_build_writes_a_table_and_a_summary(capsys: pytest.CaptureFixture[str], 
     [
         (["info", "{tmp}/none.h5"], r"there is no table at .*none\.h5; build one with 'rayfix build"),
         (["verify", "{tmp}"], r"is not a rayfix table"),
-        (["build", "{site}", "-o", "{site}"], r"site\.toml: the file there is no table; give another name"),
+        (["build", "{site}", "-o", "{site}"], r"site\.toml: the file there is not a table; give another name"),
         (["build", "{tmp}/none.toml", "-o", "{tmp}/t.h5"], r"there is no site file at .*none\.toml"),
         (["check", "{tmp}/none.toml"], r"there is no site file at .*none\.toml"),
         (["build", "{site}", "-o", "{tmp}/no/such/t.h5"], r"there is no folder .*no/such; create it first"),
-        (["build", "{site}", "-o", "{tmp}/t.h5", "--jobs", "0"], r"--jobs: '0' is not a number of jobs"),
-        (["build", "{site}", "-o", "{tmp}/t.h5", "--jobs", "many"], r"--jobs: 'many' is not a number of jobs; give 1"),
+        (["build", "{site}", "-o", "{tmp}/t.h5", "--jobs", "0"], r"--jobs: '0' is not a valid number of jobs"),
+        (
+            ["build", "{site}", "-o", "{tmp}/t.h5", "--jobs", "many"],
+            r"--jobs: 'many' is not a valid number of jobs; give 1",
+        ),
         (
             ["serve", "{table}", "--root-path", "/a/../b"],
-            r"'/a/\.\./b' is no path of plain segments; give e.g\. /rayfix",
+            r"'/a/\.\./b' is not a plain path; give e.g\. /rayfix",
         ),
         (["locate", "{table}", "{tmp}/none.json"], r"none\.json cannot be read"),
         (["locate", "{table}", "{site}", "--station", "A=bs1"], r"--station is for other systems' messages"),
         (
             ["locate", "{table}", "{site}", "--format", "nrppa", "--station", "7=bs9"],
-            r"7 is to be station 'bs9', which is",
+            r"7 is mapped to station 'bs9', which is",
         ),
         (["mqtt", "{table}", "--broker", "localhost:1", "--station", "A=bs9"], r"is not in the table; it has bs1, bs2"),
-        (["plan", "{table}", "-o", "{tmp}/m.png", "--height", "1", "--seed", "-1"], r"--seed: '-1' is no seed; give"),
-        (["plot", "{table}", "{site}", "-o", "{tmp}/p.png", "--seed", "x"], r"--seed: 'x' is no seed; give"),
-        (["plot", "{table}", "{site}", "-o", "{tmp}/p.png", "--layers", ","], r"',' names no layer; give some of rays"),
-        (["plot", "{table}", "{site}", "-o", "{tmp}/p.png", "--truth", "1", "nan", "1"], r"'nan' is no coordinate"),
-        (["plot", "{table}", "{site}", "-o", "{tmp}/p"], r"p is no name of a picture; end it in \.png, \.svg or \.pdf"),
+        (
+            ["plan", "{table}", "-o", "{tmp}/m.png", "--height", "1", "--seed", "-1"],
+            r"--seed: '-1' is not a valid seed; give",
+        ),
+        (["plot", "{table}", "{site}", "-o", "{tmp}/p.png", "--seed", "x"], r"--seed: 'x' is not a valid seed; give"),
+        (
+            ["plot", "{table}", "{site}", "-o", "{tmp}/p.png", "--layers", ","],
+            r"',' names no layer; give one or more of rays",
+        ),
+        (["plot", "{table}", "{site}", "-o", "{tmp}/p.png", "--truth", "1", "nan", "1"], r"'nan' is not a coordinate"),
+        (
+            ["plot", "{table}", "{site}", "-o", "{tmp}/p"],
+            r"p is not a valid name of a picture; end it in \.png, \.svg or \.pdf",
+        ),
         (["plot", "{table}", "{site}", "-o", "{tmp}/no/p.png"], r"there is no folder .*no; create it first"),
-        (["view", "{table}", "{site}", "-o", "{site}"], r"site\.toml is not the name of a page; end it in \.html"),
+        (["view", "{table}", "{site}", "-o", "{site}"], r"site\.toml is not a valid name of a page; end it in \.html"),
         (["serve", "{tmp}/none.h5", "--port", "0"], r"there is no table at"),
-        (["serve", "{table}", "--cors-origin", "maps.example.com"], r"is no origin; give scheme, host and port"),
-        (["serve", "{table}", "--cors-origin", "https://a.example/x"], r"is no origin; give scheme, host and port"),
+        (["serve", "{table}", "--cors-origin", "maps.example.com"], r"is not an origin; give scheme, host and port"),
+        (["serve", "{table}", "--cors-origin", "https://a.example/x"], r"is not an origin; give scheme, host and port"),
         (["serve", "{table}", "--workers", "0"], r"workers is 0; give at least 1"),
         (["frobnicate"], r"invalid choice: 'frobnicate'"),
         ([], r"required: COMMAND"),

@@ -58,7 +58,7 @@ def test_the_demo_waits_for_a_service_that_works_and_shows_its_kernels(
         "import time\nprint('WARNING:  compiling kernels, once', flush=True)\nend = time.monotonic() + 5.0\n"
         "while time.monotonic() < end: pass\nprint('no table')\nraise SystemExit(2)"
     )
-    with pytest.raises(RayfixError, match=r"ended with status 2; its log \S+service.log says why: no table"):
+    with pytest.raises(RayfixError, match=r"ended with status 2; see its log \S+service.log: no table"):
         waited(tmp_path, busy)
     assert capsys.readouterr().out == "   compiling kernels, once\n"
 

@@ -148,7 +148,7 @@ def test_a_build_over_a_damaged_table_goes_on_and_says_so(
     said: list[str] = []
     assert read_former(table_path, Method(), required=False, refused=said.append) is None
     (line,) = said
-    assert line.startswith(f"nothing is taken over from the table that was there: {table_path} is damaged: ")
+    assert line.startswith(f"the existing table is not reused: {table_path} is damaged: ")
     assert read_former(tmp_path / "none.h5", Method(), required=False, refused=said.append) is None
     assert len(said) == 1
 
@@ -225,12 +225,12 @@ TRICKS = [
     (soft_link, "is a link; a table has none"),
     (link_to_another, "is a link; a table has none"),
     (external_link, "is a link; a table has none"),
-    (external_storage, "is not stored in one piece, without a filter"),
-    (virtual, "is not stored in one piece, without a filter"),
-    (chunked, "is not stored in one piece, without a filter"),
-    (compressed, "is not stored in one piece, without a filter"),
-    (huge_and_compressed, "is not stored in one piece, without a filter"),
-    (huge_and_never_written, "is not whole"),
+    (external_storage, "is not stored contiguously without a filter"),
+    (virtual, "is not stored contiguously without a filter"),
+    (chunked, "is not stored contiguously without a filter"),
+    (compressed, "is not stored contiguously without a filter"),
+    (huge_and_compressed, "is not stored contiguously without a filter"),
+    (huge_and_never_written, "is incomplete"),
     (of_objects, "is object with 1 axes"),
     (twice, "is in the file twice"),
     (a_cycle, "is in the file twice"),

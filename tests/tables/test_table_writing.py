@@ -129,7 +129,7 @@ def test_what_can_be_known_before_the_work(tmp_path: Path) -> None:
 def test_only_a_table_gives_way_to_a_table(make_content: Callable[..., Any], tmp_path: Path) -> None:
     path = tmp_path / "site.toml"
     path.write_text("[site]", encoding="utf-8")
-    with pytest.raises(TableError, match=r"site\.toml: the file there is no table; give another name"):
+    with pytest.raises(TableError, match=r"site\.toml: the file there is not a table; give another name"):
         check_writable(path)
     path.write_bytes(b"")
     check_writable(path)

@@ -1,1 +1,1 @@
-"""Antenna arrays: where a station's angles come from, and how wrong they are."""
+"""Antenna arrays: estimation of a station's angles, and the errors of the estimates."""

@@ -6,13 +6,13 @@ from rayfix_evaluation.arrays.planar import Array, PlanarArray
 
 
 def cosine_bound(array: PlanarArray, cosines: Array, power: Array, *, noise: float, num_snapshots: int) -> Array:
-    """Least covariance of any unbiased estimate of the direction cosines of uncorrelated random waves.
+    """Cramer-Rao bound on the covariance of unbiased estimates of the direction cosines of uncorrelated random waves.
 
     Parameters
     ----------
     cosines : ndarray of shape (n, 2)
     power : ndarray of shape (n,)
-        Of each wave at one antenna.
+        Power of each wave at one antenna.
     noise : float
         Power of the noise at one antenna.
     num_snapshots : int

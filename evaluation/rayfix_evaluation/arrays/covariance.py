@@ -1,4 +1,4 @@
-"""Covariances of arrays' snapshots, smoothed so that the paths of one transmission can be told apart."""
+"""Covariances of arrays' snapshots, with spatial smoothing to resolve the coherent paths of one transmission."""
 
 import numpy as np
 
@@ -11,17 +11,16 @@ def covariance(snapshots: Complex) -> Complex:
 
 
 def smoothed_covariance(snapshots: Complex, array: PlanarArray, part: PlanarArray) -> Complex:
-    """Covariance averaged over all places of a smaller array within the array, forward and backward.
+    """Covariance averaged over all subarrays of a given size, forward and backward.
 
-    Paths of one transmission are copies of one signal, and their covariance has the rank of one: no method that looks
-    at subspaces could tell them apart. Their phases differ from place to place of the smaller array, which restores
-    the rank.
+    Paths of one transmission are coherent and their covariance has rank one: subspace methods cannot resolve them.
+    Their phases differ between subarrays, and averaging restores the rank.
 
     Parameters
     ----------
     snapshots : ndarray of complex of shape (len(array), n)
     part : PlanarArray
-        The smaller array, of the same spacing.
+        The subarray, with the same spacing.
 
     Returns
     -------
@@ -30,7 +29,7 @@ def smoothed_covariance(snapshots: Complex, array: PlanarArray, part: PlanarArra
     Raises
     ------
     ValueError
-        If the smaller array does not fit.
+        If the subarray does not fit.
 
     Notes
     -----
@@ -38,7 +37,7 @@ def smoothed_covariance(snapshots: Complex, array: PlanarArray, part: PlanarArra
     Transactions on Acoustics, Speech and Signal Processing 37 (1989), along both axes.
     """
     if part.columns > array.columns or part.rows > array.rows or part.spacing != array.spacing:
-        raise ValueError(f"{part} is no part of {array}; make it as large at most, and of the same spacing")
+        raise ValueError(f"{part} is not part of {array}; it must have the same spacing and be no larger")
     grid = snapshots.reshape(array.columns, array.rows, -1)
     total = np.zeros((len(part), len(part)), np.complex128)
     count = 0
@@ -48,20 +47,20 @@ def smoothed_covariance(snapshots: Complex, array: PlanarArray, part: PlanarArra
             total += covariance(window)
             count += 1
     forward = total / count
-    # Seen from the other end of the array, a wave is its conjugate.
+    # Backward average: with the antennas in reverse order, a wave is its conjugate.
     return np.asarray(0.5 * (forward + forward[::-1, ::-1].conj()))
 
 
 def num_sources(eigenvalues: Array, num_snapshots: int, *, most: int) -> int:
-    """Tell the number of signals by the minimum description length.
+    """Estimate the number of signals by the minimum description length.
 
     Parameters
     ----------
     eigenvalues : ndarray of shape (n,)
-        Of the covariance.
+        Eigenvalues of the covariance.
     num_snapshots : int
     most : int
-        Largest answer; the least is 1.
+        Largest result; the smallest is 1.
 
     Notes
     -----

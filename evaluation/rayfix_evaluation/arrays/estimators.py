@@ -1,7 +1,7 @@
 """Directions from covariances: Delay-and-Sum, MVDR, MUSIC and ESPRIT on a uniform planar array.
 
-The estimators are written here, for no kept library has all of them for planar arrays: what there is has linear arrays
-only, or other fields' signals.
+The estimators are implemented here because no maintained library has all of them for planar arrays: existing ones have
+only linear arrays or signals of other fields.
 """
 
 from collections.abc import Callable
@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from rayfix_evaluation.arrays.planar import Array, Complex, PlanarArray
 
-_PER_BEAM = 8.0  # points of the search's grid in a beam's width
-_PRECISION = 1e-7  # of the direction cosines at which a search ends
-_MOST_STEPS = 300  # of a search, which on a flat top would go on by what rounding makes higher
-_LOADING = 1e-6  # share of the mean power that is added to each antenna's, so that MVDR can invert
+_PER_BEAM = 8.0  # points of the search grid per beam width
+_PRECISION = 1e-7  # step of the direction cosines at which a search ends
+_MOST_STEPS = 300  # of a search, which could follow rounding errors on a flat maximum
+_LOADING = 1e-6  # fraction of the mean power that is added to the diagonal, to make it invertible for MVDR
 
 
 @dataclass(frozen=True, kw_only=True)
 class Waves:
-    """Waves that were found, strongest first.
+    """Estimated waves, strongest first.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Waves:
 
 
 Estimator = Callable[[Complex, PlanarArray, int], Waves]
-"""Takes a covariance, the array that it is of, and the number of waves to look for at most."""
+"""Takes a covariance, its array, and the largest number of waves to find."""
 
 
 def delay_and_sum(cov: Complex, array: PlanarArray, count: int) -> Waves:
@@ -55,7 +55,7 @@ def delay_and_sum(cov: Complex, array: PlanarArray, count: int) -> Waves:
 
 
 def mvdr(cov: Complex, array: PlanarArray, count: int) -> Waves:
-    """Find the peaks of the power that is left when all other directions are suppressed: 1 / (a^H R^-1 a).
+    """Find the peaks of the minimum-variance spectrum 1 / (a^H R^-1 a).
 
     Notes
     -----
@@ -68,7 +68,7 @@ def mvdr(cov: Complex, array: PlanarArray, count: int) -> Waves:
 
 
 def music(cov: Complex, array: PlanarArray, count: int) -> Waves:
-    """Find the directions that are the least in the noise's subspace.
+    """Find the directions with the smallest projection onto the noise subspace.
 
     Notes
     -----
@@ -82,25 +82,26 @@ def music(cov: Complex, array: PlanarArray, count: int) -> Waves:
 
 
 def esprit(cov: Complex, array: PlanarArray, count: int) -> Waves:
-    """Find directions from the turn that a step of one column or one row makes of the signals' subspace.
+    """Find directions from the rotation of the signal subspace between subarrays shifted by one column or one row.
 
     Notes
     -----
     R. Roy, T. Kailath, "ESPRIT: estimation of signal parameters via rotational invariance techniques", IEEE
-    Transactions on Acoustics, Speech and Signal Processing 37 (1989). Both axes' turns have the same eigenvectors,
-    which pairs them, as in M. D. Zoltowski, M. Haardt, C. P. Mathews, IEEE Transactions on Signal Processing 44 (1996).
+    Transactions on Acoustics, Speech and Signal Processing 37 (1989). The rotations of both axes have the same
+    eigenvectors, which pairs them, as in M. D. Zoltowski, M. Haardt, C. P. Mathews, IEEE Transactions on Signal
+    Processing 44 (1996).
     """
     signals = np.linalg.eigh(cov)[1][:, len(array) - count :]
     grid = signals.reshape(array.columns, array.rows, count)
     turns = []
     for before, after in ((grid[:-1], grid[1:]), (grid[:, :-1], grid[:, 1:])):
         turns.append(np.linalg.lstsq(before.reshape(-1, count), after.reshape(-1, count), rcond=None)[0])
-    # Any sum of the two has these eigenvectors; one with an irrational share hardly has equal eigenvalues.
+    # Any linear combination of the two has these eigenvectors; with an irrational factor, eigenvalues hardly coincide.
     vectors = np.linalg.eig(turns[0] + np.sqrt(0.5) * turns[1])[1]
     inverse = np.linalg.pinv(vectors)
     phases = [np.angle(np.einsum("ij,jk,ki->i", inverse, turn, vectors)) for turn in turns]
     cosines = np.stack(phases, axis=-1) / (2.0 * np.pi * array.spacing)
-    # Noise may turn a wave from the rim out of what there is.
+    # Noise can move direction cosines outside of the unit circle.
     cosines /= np.maximum(1.0, np.linalg.norm(cosines, axis=1, keepdims=True))
     return _sorted(cosines, wave_powers(cov, array, cosines))
 
@@ -111,13 +112,13 @@ ESTIMATORS: dict[str, Estimator] = {
     "MUSIC": music,
     "ESPRIT": esprit,
 }
-"""By the name in tables and figures."""
+"""Estimators by name in tables and figures."""
 
 
 def wave_powers(cov: Complex, array: PlanarArray, cosines: Array) -> Array:
     """Powers of waves from given directions, by least squares, shape (n,).
 
-    The noise's power, which is the mean of the eigenvalues that no wave takes, is taken off.
+    The noise power, the mean of the remaining eigenvalues, is subtracted.
     """
     noise = np.linalg.eigvalsh(cov)[: max(1, len(array) - len(cosines))].mean()
     fitted = np.linalg.pinv(array.steering(cosines))
@@ -137,7 +138,7 @@ class _Form:
     Attributes
     ----------
     sums : ndarray of complex of shape (2 columns - 1, 2 rows - 1)
-        Of the entries of Q between antennas that are as many columns and rows apart.
+        Sums of the entries of Q over all pairs of antennas with the same offset in columns and rows.
     spacing : float
     """
 
@@ -184,7 +185,7 @@ def _peaks(form: _Form, array: PlanarArray, count: int) -> Array:
 
 
 def _local_maxima(values: Array) -> NDArray[np.bool_]:
-    """Points of a grid that are at least as high as the eight around them."""
+    """Points of a grid that are at least as high as their eight neighbours."""
     padded = np.pad(values, 1, constant_values=-np.inf)
     highest = np.isfinite(values)
     for i in range(3):
@@ -195,7 +196,7 @@ def _local_maxima(values: Array) -> NDArray[np.bool_]:
 
 
 def _climb(form: _Form, starts: Array, step: float) -> Array:
-    """Climb from starts of shape (n, 2) to the nearest peaks by ever smaller steps on a grid of nine points."""
+    """Climb from starts of shape (n, 2) to the nearest peaks, by decreasing steps on a pattern of nine points."""
     offsets = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 2)
     points = starts.copy()
     widths = np.full(len(points), step)
@@ -208,7 +209,7 @@ def _climb(form: _Form, starts: Array, step: float) -> Array:
         values = form.at(around.reshape(-1, 2)).reshape(len(points), -1)
         best = np.argmax(values, axis=1)
         row = np.arange(len(points))
-        # On the rim several of the nine are one: only what is higher than the middle is a step.
+        # On the rim several of the nine points coincide: only a higher value than in the middle counts as a step.
         higher = values[row, best] > values[:, 4]
         points = np.where(higher[:, None], around[row, best], points)
         widths = np.where(higher, widths, 0.5 * widths)

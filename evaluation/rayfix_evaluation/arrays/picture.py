@@ -23,9 +23,9 @@ def draw_angle_errors(path: str | Path, studies: Mapping[str, tuple[ArrayStudy, 
     Parameters
     ----------
     path : str or Path
-        Its suffix says the type: .png, .svg or .pdf.
+        The suffix is the type: .png, .svg or .pdf.
     studies : mapping of str to (ArrayStudy, mapping of str to AngleErrors)
-        By the panel's title.
+        Studies by title of the panel.
     """
     figure = Figure(figsize=(4.6 * len(studies), 3.8), layout="constrained")
     FigureCanvasAgg(figure)
@@ -51,6 +51,6 @@ def draw_angle_errors(path: str | Path, studies: Mapping[str, tuple[ArrayStudy, 
         axes.grid(alpha=0.25)
         axes.set_xlabel("angle to the strongest path [deg]")
         axes.set_title(title, loc="left", fontsize=10, color=_INK)
-    panels[0].set_ylabel("share of reports")
+    panels[0].set_ylabel("fraction of reports")
     panels[0].legend(frameon=False, fontsize=9, loc="upper left")
     save_picture(figure, path)

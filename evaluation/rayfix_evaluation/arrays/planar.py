@@ -1,8 +1,8 @@
-"""A uniform planar array, and what its antennas receive of the paths to a station.
+"""A uniform planar array, and the signals of a station's paths at its antennas.
 
 The array lies in the y-z plane of the mounted board (docs/mounting.md) and looks along its x axis. A plane wave from
 the board's direction d meets antenna (n, m), which is n columns along y and m rows along z from the middle, with the
-phase 2 pi spacing (n d_y + m d_z), so that the direction cosines (d_y, d_z) are what the array measures.
+phase 2 pi spacing (n d_y + m d_z): the array measures the direction cosines (d_y, d_z).
 """
 
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ class PlanarArray:
 
 
 def to_cosines(station: Station, azimuth: Array, zenith: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Direction cosines of directions in the scene, and whether they come from before the array.
+    """Direction cosines of directions in the scene, and whether they are in front of the array.
 
     Parameters
     ----------
@@ -88,23 +88,23 @@ def to_cosines(station: Station, azimuth: Array, zenith: Array) -> tuple[Array, 
 
 
 def to_scene_direction(station: Station, cosines: Array) -> Array:
-    """Turn direction cosines of waves from before the array into unit vectors of the scene, shape (n, 3)."""
+    """Convert direction cosines of waves from the front into unit vectors in the scene frame, shape (n, 3)."""
     ahead = np.sqrt(np.maximum(1.0 - np.square(cosines).sum(axis=1), 0.0))
     return np.asarray(np.column_stack([ahead, cosines]) @ board_to_scene(station).T)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Signal:
-    """What a UE sends.
+    """The signal of a UE.
 
     Attributes
     ----------
     bandwidth : float, Hz
-        Over which the subcarriers are spread evenly.
+        Bandwidth that the subcarriers divide uniformly.
     subcarriers : int
-        Snapshots of the array.
+        Number of subcarriers; each is a snapshot of the array.
     snr_db : float, dB
-        Of all paths together, at one antenna and subcarrier.
+        Signal-to-noise ratio of all paths together, at one antenna and subcarrier.
     """
 
     bandwidth: float = 100e6
@@ -115,15 +115,15 @@ class Signal:
 def receive(
     array: PlanarArray, station: Station, paths: Paths, signal: Signal, rng: np.random.Generator
 ) -> Complex | None:
-    """Simulate the snapshots of an array: one of each subcarrier, all paths together, and noise.
+    """Simulate the snapshots of an array, one for each subcarrier: the sum of all paths, and noise.
 
-    A path has its gain, the phase that its length makes of each subcarrier, and a random phase, since no twin knows
-    lengths to a part of a wavelength. The array's back is screened.
+    A path has its gain, a phase by its length at each subcarrier, and a random phase, because a twin is not accurate to
+    a fraction of a wavelength. The array receives nothing from behind.
 
     Returns
     -------
     ndarray of complex of shape (n_antennas, subcarriers), or None
-        Of noise power 1; None where no path comes from before the array.
+        With noise power 1; None if no path arrives from the front.
     """
     cosines, before = to_cosines(station, paths.azimuth, paths.zenith)
     if not before.any():

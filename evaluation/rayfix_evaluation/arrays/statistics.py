@@ -1,4 +1,4 @@
-"""Statistics of angle errors, in the form that reports and site files carry."""
+"""Statistics of angle errors, in the form of reports and site files."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,24 +11,24 @@ from rayfix_service.fusion.measurements.report import GAUSSIAN, ErrorModel
 Array = NDArray[np.float64]
 
 LEAST_TAIL = 1e-3
-"""Share of wide errors below which they are left out: less is not allowed in a report."""
+"""Smallest fraction of wide errors; smaller ones are not allowed in a report and are neglected."""
 
 _STEPS = 500
 _MOST_TAIL = 0.5
-_SCALES = (1.5, 20.0)  # what a report may say
+_SCALES = (1.5, 20.0)  # range in a report
 _TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AngleErrors:
-    """Errors of n reported angles, estimated less true.
+    """Errors of n reported angles, estimated minus true.
 
     Attributes
     ----------
     azimuth, zenith : ndarray of shape (n,), rad
-        Of the angles themselves.
+        Errors of the angles themselves.
     apart : ndarray of shape (n,), rad
-        Between the estimated direction and the true one.
+        Angle between the estimated direction and the true one.
     other_path : ndarray of bool of shape (n,)
         Whether the estimate is nearer to another path than to the strongest.
     """
@@ -45,23 +45,23 @@ class AngleErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class AngleStatistics:
-    """How wrong the angles of one kind of station are.
+    """Error statistics of one kind of station.
 
     Attributes
     ----------
     num_angles : int
     outlier_share : float
-        Share of the angles that are off by more than a limit; the other figures leave them out.
+        Fraction of the angles with errors above a limit; they are excluded from the other statistics.
     other_path_share : float
-        Share of all angles that are nearer to another path than to the strongest.
+        Fraction of all angles that are nearer to another path than to the strongest.
     azimuth_bias, zenith_bias : float, rad
         Medians of the errors.
     azimuth_stdev, zenith_stdev : float, rad
-        About the bias; of the narrower Gaussian where the errors have tails.
+        Standard deviations about the bias; of the narrower Gaussian if the errors have heavy tails.
     bias_stdev : float, rad
         Uncertainty of the larger bias.
     error_model : ErrorModel
-        Share and width of the tails.
+        Probability and width of the tails.
     """
 
     num_angles: int
@@ -98,17 +98,17 @@ class AngleStatistics:
 
 
 def angle_statistics(errors: AngleErrors, *, limit: float) -> AngleStatistics:
-    """Sum errors up.
+    """Compute the statistics of errors.
 
     Parameters
     ----------
     limit : float, rad
-        Angles that are off by more are outliers.
+        Angles with larger errors are outliers.
 
     Raises
     ------
     ValueError
-        If less than ten angles are no outliers.
+        If fewer than ten angles are inliers.
     """
     kept = errors.apart <= limit
     if kept.sum() < 10:
@@ -118,7 +118,7 @@ def angle_statistics(errors: AngleErrors, *, limit: float) -> AngleStatistics:
     both = np.stack([errors.azimuth[kept], errors.zenith[kept]], axis=-1)
     bias = np.median(both, axis=0)
     stdev, model = fit_tails(both - bias)
-    # The median's deviation is sqrt(pi / 2) times the mean's.
+    # The median's standard deviation is sqrt(pi / 2) times the mean's.
     bias_stdev = float(np.sqrt(0.5 * np.pi / kept.sum()) * stdev.max())
     return AngleStatistics(
         num_angles=len(errors),
@@ -139,18 +139,18 @@ def fit_tails(errors: Array) -> tuple[Array, ErrorModel]:
     Parameters
     ----------
     errors : ndarray of shape (n, d)
-        About zero.
+        Errors with zero mean.
 
     Returns
     -------
     stdev : ndarray of shape (d,)
         Standard deviations of the narrower Gaussian.
     error_model : ErrorModel
-        Gaussian where the tails are hardly any.
+        Gaussian if the tails are negligible.
 
     Notes
     -----
-    The wider Gaussian has the same shape, so that its share and its scale are one number each, as in reports. A. P.
+    The wider Gaussian has the same shape: its probability and its scale are one number each, as in reports. A. P.
     Dempster, N. M. Laird, D. B. Rubin, Journal of the Royal Statistical Society B 39 (1977).
     """
     squares = np.square(errors)

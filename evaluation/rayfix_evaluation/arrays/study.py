@@ -1,4 +1,4 @@
-"""The angles that arrays report in a scene: simulated snapshots through each estimator."""
+"""Errors of the angles that arrays report in a scene: each estimator on simulated snapshots."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,16 +26,16 @@ from rayfix_tables.site import Station
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayStudy:
-    """An array and what is made of its snapshots.
+    """An array, its signal, and the processing of its snapshots.
 
     Attributes
     ----------
     array : PlanarArray
     part : PlanarArray
-        Smaller array for the smoothing, which all estimators but Delay-and-Sum need.
+        Subarray of the spatial smoothing, which all estimators except Delay-and-Sum need.
     signal : Signal
     most_waves : int
-        Largest number of waves that an estimator looks for.
+        Largest number of waves that an estimator searches for.
     """
 
     array: PlanarArray
@@ -49,7 +49,7 @@ class ArrayStudy:
         return self.array.beam_width
 
     def waves(self, snapshots: Complex, name: str) -> Waves:
-        """Waves that an estimator finds in snapshots, strongest first; see :data:`ESTIMATORS` for the names."""
+        """Estimate waves from snapshots, strongest first; see :data:`ESTIMATORS` for the names."""
         if name == "Delay-and-Sum":
             return ESTIMATORS[name](covariance(snapshots), self.array, 1)
         cov = smoothed_covariance(snapshots, self.array, self.part)
@@ -60,9 +60,9 @@ class ArrayStudy:
 def angle_errors(
     drops: Sequence[Drop], stations: Sequence[Station], study: ArrayStudy, rng: np.random.Generator
 ) -> dict[str, AngleErrors]:
-    """Errors of each estimator's strongest wave as an angle of the strongest path before the array.
+    """Errors of each estimator's strongest wave relative to the strongest path in front of the array.
 
-    All estimators get the same snapshots. Pairs of drop and station without a path before the array are left out.
+    All estimators use the same snapshots. Pairs of drop and station without a path from the front are left out.
     """
     rows: dict[str, list[tuple[float, float, float, float]]] = {name: [] for name in ESTIMATORS}
     for drop in drops:
@@ -84,7 +84,7 @@ def angle_errors(
 
 
 def _error(found: Array, station: Station, paths: Paths) -> tuple[float, float, float, float]:
-    """Error of azimuth and zenith, the angle between, and 1 where another path is nearer."""
+    """Errors of azimuth and zenith, angle between the directions, and 1 if another path is nearer."""
     _, before = to_cosines(station, paths.azimuth, paths.zenith)
     azimuth, zenith = paths.azimuth[before], paths.zenith[before]
     apart = np.arccos(np.clip(direction(azimuth, zenith) @ found, -1.0, 1.0))

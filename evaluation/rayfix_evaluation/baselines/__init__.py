@@ -1,1 +1,1 @@
-"""Other methods of locating, which rayfix is compared with."""
+"""Other positioning methods for comparison with rayfix."""

@@ -1,8 +1,8 @@
-"""Fingerprinting: the places of a simulated map that look most like the report.
+"""Fingerprinting: the positions of a simulated map with the features nearest to the report.
 
 The weighted k nearest neighbours of P. Bahl, V. N. Padmanabhan, "RADAR: an in-building RF-based user location and
-tracking system", INFOCOM 2000, with the angles and lengths of the strongest paths as the fingerprint, which a forward
-solver finds for a grid of places.
+tracking system", INFOCOM 2000, with the angles and lengths of the strongest paths as the fingerprint. A forward solver
+finds them for a grid of positions.
 """
 
 from dataclasses import dataclass
@@ -22,22 +22,22 @@ from rayfix_tables.table import Table
 Array = NDArray[np.float64]
 
 _UNHEARD = 10.0
-"""A place that a reporting station does not hear is this many deviations away, for each measurement."""
+"""Distance, in standard deviations per measurement, of a position that is not audible to the reporting station."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RadioMap:
-    """What the stations hear of the strongest path from each place.
+    """The strongest path from each position of a grid to each station.
 
     Attributes
     ----------
     spacing : float, m
-        Between neighbouring places along each axis.
+        Spacing of neighbouring positions along each axis.
     position : ndarray of shape (n, 3), m
     direction : mapping of str to ndarray of shape (n, 3)
-        Unit vector from each station towards the incoming ray; zero where the station hears nothing.
+        Unit vector from each station towards the incoming ray; zero where there is no path.
     path_length : mapping of str to ndarray of shape (n,), m
-        Zero where the station hears nothing.
+        Zero where there is no path.
     heard : mapping of str to ndarray of bool, shape (n,)
     """
 
@@ -48,28 +48,28 @@ class RadioMap:
     heard: dict[str, NDArray[np.bool_]]
 
     def __len__(self) -> int:
-        """Return the number of places."""
+        """Return the number of positions."""
         return len(self.position)
 
 
 def simulate_map(table: Table, *, spacing: float = 0.5, margin: float = 0.06) -> RadioMap:
-    """Find the strongest paths to a grid of places in a table's free space.
+    """Find the strongest paths to a grid of positions in a table's free space.
 
     Parameters
     ----------
     spacing : float, m
-        Of the grid.
+        Spacing of the grid.
     margin : float, m
-        Least distance of a place, along each axis, from solids and the building's shell.
+        Smallest distance of a position, along each axis, from solids and the building's shell.
 
     Raises
     ------
     ValueError
-        If no place of the grid is free.
+        If no position of the grid is free.
     """
     free_space = table.scene.free_space
     size = np.array(free_space.free.shape) * free_space.voxel_size
-    # The grid sits in the middle of the building.
+    # The grid is centred in the building.
     counts = np.maximum(1, np.floor(size / spacing).astype(np.int64))
     axes = [
         low + 0.5 * (extent - (n - 1) * spacing) + np.arange(n) * spacing
@@ -78,7 +78,7 @@ def simulate_map(table: Table, *, spacing: float = 0.5, margin: float = 0.06) ->
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     grid = grid[clear_of_solids(free_space, grid, margin=margin)]
     if not len(grid):
-        raise ValueError(f"no place of a grid of {spacing} m is free; make the spacing smaller")
+        raise ValueError(f"no position of a grid of {spacing} m is free; reduce the spacing")
     solver = solver_of(table)
     directions, lengths, heard = {}, {}, {}
     for station in table.site.stations:
@@ -96,10 +96,10 @@ def simulate_map(table: Table, *, spacing: float = 0.5, margin: float = 0.06) ->
 
 @dataclass(frozen=True, kw_only=True)
 class Fingerprinting:
-    """The mean of the nearest places of a map, weighted by the inverse of their distance.
+    """The mean of the nearest positions of a map, weighted by the inverse of their distance in feature space.
 
-    The distance is that of the measured angles and lengths in standard deviations, of the measurement and of what half
-    the map's spacing makes of it together. What is not in the report counts for nothing.
+    The distance is that of the measured angles and lengths in standard deviations, which combine the measurement's with
+    the effect of half the map's spacing. Features that are not in the report are ignored.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class Fingerprinting:
     site : SiteInfo
         Stations.
     neighbours : int
-        Places that are averaged.
+        Number of positions that are averaged.
     """
 
     radio_map: RadioMap
@@ -117,11 +117,11 @@ class Fingerprinting:
 
     @classmethod
     def of_table(cls, table: Table, *, spacing: float = 0.5) -> "Fingerprinting":
-        """Simulate the map of a table's site, which takes some milliseconds for each place and station."""
+        """Simulate the map of a table's site, which takes some milliseconds for each position and station."""
         return cls(radio_map=simulate_map(table, spacing=spacing), site=table.site)
 
     def locate(self, report: Report) -> Array | None:
-        """Position of shape (3,), m, or None where the report has neither angles nor times."""
+        """Position of shape (3,), m, or None if the report has neither angles nor times."""
         columns = self._columns(sort_for_rivals(report, self.site))
         if not columns:
             return None
@@ -129,12 +129,12 @@ class Fingerprinting:
         measured = np.concatenate([value for _, value in columns])
         neighbours = NearestNeighbors(n_neighbors=min(self.neighbours, len(places)), algorithm="brute")
         (distance,), (index,) = neighbours.fit(places).kneighbors(measured[None])
-        # A place that fits exactly is the answer.
+        # A position with the distance 0 is the answer.
         weight = 1.0 / np.maximum(distance, 1e-9)
         return np.asarray(weight @ self.radio_map.position[index] / weight.sum())
 
     def _columns(self, report: PaperReport) -> list[tuple[Array, Array]]:
-        """Features of all places, shape (n, m), and of the report, shape (m,), for each measurement."""
+        """Features of all positions, shape (n, m), and of the report, shape (m,), for each measurement."""
         known, half = self.radio_map, 0.5 * self.radio_map.spacing
         columns = []
         for name, measured in report.directions.items():
@@ -142,7 +142,7 @@ class Fingerprinting:
             heard = known.heard[name]
             reach = float(np.median(known.path_length[name][heard])) if heard.any() else np.inf
             scale = float(np.hypot(deviation, half / reach))
-            target = direction(measured.azimuth, measured.zenith)  # type: ignore[arg-type]  # lone ones were refused
+            target = direction(measured.azimuth, measured.zenith)  # type: ignore[arg-type]  # single ones were refused
             columns.append(_features(known.direction[name] / scale, target / scale, heard))
         for name, (length, stdev) in report.ranges.items():
             scale = float(np.hypot(stdev, half))
@@ -160,6 +160,6 @@ class Fingerprinting:
 
 
 def _features(places: Array, measured: Array, heard: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Features with one more that keeps away places where the measurement would not have been made."""
+    """Features with an additional one that penalises positions that are not audible."""
     features = np.where(heard[:, None], places, measured)
     return np.column_stack([features, np.where(heard, 0.0, _UNHEARD)]), np.append(measured, 0.0)

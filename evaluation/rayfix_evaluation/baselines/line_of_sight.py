@@ -25,11 +25,11 @@ from rayfix_tables.site import SiteInfo
 Array = NDArray[np.float64]
 
 Kind = Literal["angles", "ranges", "differences"]
-"""What is fitted: angles of arrival, propagation times, or differences of arrival times."""
+"""Measurements that are fitted: angles of arrival, propagation times, or differences of arrival times."""
 
 _GRID = (12, 12, 5)  # points of the coarse grid along each axis
-_STARTS = 4  # points of the grid that a search starts from
-_APART = 0.2  # of the scene's diagonal, between these
+_STARTS = 4  # points of the grid where a search starts
+_APART = 0.2  # of the scene's diagonal, smallest distance between these
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,10 +41,10 @@ class LineOfSight:
     site : SiteInfo
         Stations.
     bounds : ndarray of shape (2, 3), m
-        Low and high corner of where the transmitter can be.
+        Low and high corner of the region of possible positions.
     kinds : tuple of {"angles", "ranges", "differences"}
-        What is fitted; the height, where the report knows it, is fitted too. Times of arrival count as differences, for
-        their clock is unknown.
+        Measurements that are fitted, with the height if the report has one. Times of arrival are used as differences
+        because their clock is unknown.
     """
 
     site: SiteInfo
@@ -57,7 +57,7 @@ class LineOfSight:
         return f"line of sight, {' and '.join(self.kinds)}"
 
     def locate(self, report: Report) -> Array | None:
-        """Position of shape (3,), m, or None where there are fewer than three equations.
+        """Position of shape (3,), m, or None with fewer than three equations.
 
         An angle of arrival is two equations, a range, a time difference and a height are one each.
         """
@@ -139,7 +139,7 @@ class _Differences:
 
     @classmethod
     def of(cls, differences: Sequence[RelativeLength], stations: Array, reference: Array) -> "_Differences":
-        """Share the noise out: all differences have the reference's, half that of the least noisy of them."""
+        """Split the variances: all differences share the reference's, half of that of the most accurate difference."""
         variance = np.square([d.stdev for d in differences])
         shared = 0.5 * variance.min()
         cov = np.diag(variance - shared) + shared
@@ -175,7 +175,7 @@ class _Height:
 
 
 def _terms(report: PaperReport, height: Height | None, site: SiteInfo, kinds: Sequence[Kind]) -> list[_Term]:
-    """Equations of the kinds that are fitted; none of any kind if nothing but the height is known."""
+    """Equations of the kinds that are fitted; empty if only the height is known."""
     places = station_positions(site)
     terms: list[_Term] = []
     if "angles" in kinds and report.directions:
@@ -194,7 +194,7 @@ def _terms(report: PaperReport, height: Height | None, site: SiteInfo, kinds: Se
 
 
 def _starts(terms: Sequence[_Term], bounds: Array) -> list[Array]:
-    """Points of a coarse grid of the least squares, away from each other."""
+    """Points of a coarse grid with the least squares, at a distance from each other."""
     low, high = bounds
     axes = [low[i] + (np.arange(n) + 0.5) / n * (high[i] - low[i]) for i, n in enumerate(_GRID)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

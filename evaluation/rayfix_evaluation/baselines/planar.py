@@ -1,4 +1,4 @@
-"""The paper's predecessor in two dimensions: where noisy rays cross the plane of the transmitter's known height.
+"""The paper's predecessor in two dimensions: intersections of noisy rays with the plane of the known height.
 
 V. Corlay, V.-H. Nguyen, N. Gresset, "Probabilistic positioning via ray tracing with noisy angle of arrival
 measurements", IEEE Communications Letters 28 (2024), arXiv:2403.00611, after arXiv:2308.08441: rays are launched around
@@ -32,11 +32,11 @@ class PlanarPredecessor:
     site : SiteInfo
         Stations.
     height : float or None, m
-        z of the transmitter where a report does not say it.
+        z of the transmitter if a report does not state it.
     settings : PaperSettings
-        Of which the number of rays, of points, of components and of products count.
+        The numbers of rays, points, components and products are used.
     seed : int
-        Of the draws, which are the same for each report.
+        Seed of the draws, which are the same for each report.
     """
 
     launcher: Launcher
@@ -48,11 +48,11 @@ class PlanarPredecessor:
 
     @classmethod
     def of_table(cls, table: Table, *, height: float | None = None, seed: int = 1) -> "PlanarPredecessor":
-        """Locate in the scene and among the stations of a table."""
+        """Create the method for a table's scene and stations."""
         return cls(launcher=Launcher.of_table(table), site=table.site, height=height, seed=seed)
 
     def locate(self, report: Report) -> Array | None:
-        """Position of shape (3,), m, or None where no height is known or no ray crosses its plane."""
+        """Position of shape (3,), m, or None if no height is known or no ray crosses its plane."""
         height = self.height if report.height is None else report.height.z
         if height is None:
             return None
@@ -63,9 +63,9 @@ class PlanarPredecessor:
         return np.array([x, y, height])
 
     def mixtures(self, report: Report, height: float) -> list[Mixture]:
-        """Mixture over (x, y), m, that each station's angle gives at a height, m.
+        """Mixture over (x, y), m, for each station's angle at a height, m.
 
-        Stations of whose rays not even two cross the plane have none.
+        Stations with fewer than two rays that cross the plane have none.
         """
         rng = np.random.default_rng(self.seed)
         places = station_positions(self.site)
@@ -82,7 +82,7 @@ class PlanarPredecessor:
 
 
 def plane_crossings(launcher: Launcher, station: Array, directions: Array, height: float) -> Array:
-    """Where mirrored rays cross a horizontal plane.
+    """Intersections of reflected rays with a horizontal plane.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def plane_crossings(launcher: Launcher, station: Array, directions: Array, heigh
     Returns
     -------
     ndarray of shape (n_points, 2), m
-        x and y of each crossing; a ray has one for each straight piece that crosses the plane.
+        x and y of each crossing; a ray has one for each of its straight segments that crosses the plane.
     """
     segments = launcher.trace(station, directions)
     ray, depth = np.nonzero(segments.sequence >= 0)
@@ -104,6 +104,6 @@ def plane_crossings(launcher: Launcher, station: Array, directions: Array, heigh
     heading = np.einsum("nij,nj->ni", segments.sequences.mirrors[sequence], directions[ray])
     with np.errstate(divide="ignore", invalid="ignore"):
         length = (height - image[:, 2]) / heading[:, 2]
-    # What runs within the plane crosses nowhere: its length is infinite or not a number.
+    # A segment within the plane has no crossing: its length is infinite or not a number.
     crosses = (length >= segments.start[ray, depth]) & (length < segments.end[ray, depth])
     return np.asarray((image + np.where(crosses, length, 0.0)[:, None] * heading)[crosses, :2])

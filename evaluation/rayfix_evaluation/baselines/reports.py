@@ -1,4 +1,4 @@
-"""A report as the rivals take it."""
+"""Reports in the form of the baselines."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from rayfix_tables.site import SiteInfo
 
 
 def sort_for_rivals(report: Report, site: SiteInfo) -> PaperReport:
-    """Sort a report by station, whether it holds a height or not.
+    """Sort a report by station, with or without a height.
 
     Raises
     ------

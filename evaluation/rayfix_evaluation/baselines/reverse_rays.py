@@ -1,9 +1,9 @@
-"""Reverse ray tracing without noise: where rays launched in the measured directions come nearest to each other.
+"""Reverse ray tracing without noise: the point nearest to rays in the measured directions.
 
-One ray per station goes out in the measured direction and is mirrored at the walls, and the transmitter is taken to be
-where the rays meet, as in S. Kikuchi, A. Sano, H. Tsuji, "Blind mobile positioning in urban environment based on
-ray-tracing analysis", EURASIP Journal on Applied Signal Processing 2006, 038989. Which straight piece of each ray takes
-part is part of the search. Angles count as exact; times and heights are left.
+One ray per station is launched in the measured direction and reflected at the walls. The transmitter is assumed where
+the rays meet, as in S. Kikuchi, A. Sano, H. Tsuji, "Blind mobile positioning in urban environment based on ray-tracing
+analysis", EURASIP Journal on Applied Signal Processing 2006, 038989. The search includes the choice of each ray's
+straight segment. Angles are taken as exact; times and heights are ignored.
 """
 
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ from rayfix_tables.table import Table
 
 Array = NDArray[np.float64]
 
-_SEEDS = 8  # crossings of two rays that the search goes on from
+_SEEDS = 8  # crossings of two rays where the search starts
 _MOST_STEPS = 30
-_PARALLEL = 1e-9  # least squared sine between lines that are taken to have one nearest point
+_PARALLEL = 1e-9  # smallest squared sine of the angle between lines that are not treated as parallel
 
 
 @dataclass(frozen=True, kw_only=True)
 class Polyline:
-    """Straight pieces of one ray.
+    """Straight segments of one ray.
 
     Attributes
     ----------
@@ -43,14 +43,14 @@ class Polyline:
     length: Array
 
     def nearest(self, points: Array) -> tuple[Array, Array, Array]:
-        """Nearest piece to each point of shape (n, 3), m.
+        """Nearest segment to each point of shape (n, 3), m.
 
         Returns
         -------
         foot : ndarray of shape (n, 3), m
             Nearest point of the ray.
         heading : ndarray of shape (n, 3)
-            Of the piece; zero where the foot is an end of it, so that the ray goes no farther there.
+            Of the segment; zero if the foot is one of its ends.
         distance : ndarray of shape (n,), m
         """
         along = np.einsum("npi,pi->np", points[:, None] - self.start, self.heading)
@@ -65,7 +65,7 @@ class Polyline:
 
 @dataclass(frozen=True, kw_only=True)
 class ReverseRays:
-    """The point nearest to one mirrored ray of each station, in the mean square.
+    """The point with the least mean square distance from one reflected ray of each station.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class ReverseRays:
 
     def _ray(self, station: Array, measured: Direction) -> Polyline:
         azimuth, zenith = measured.azimuth, measured.zenith
-        assert azimuth is not None  # what else there is was refused with the report
+        assert azimuth is not None  # reports without it were refused
         assert zenith is not None
         heading = direction(azimuth, zenith)
         segments = self.launcher.trace(station, heading[None])
@@ -118,8 +118,9 @@ def meeting_point(rays: list[Polyline]) -> Array:
 
     Notes
     -----
-    The sum has many minima, for each ray has several pieces. The search starts at the crossings of any two rays that
-    have the least sum, and solves for the point nearest to the lines of the then nearest pieces until that stays.
+    The sum has many minima, because each ray has several segments. The search starts at the crossings of two rays with
+    the least sums. It solves for the point nearest to the lines of the nearest segments, and repeats this until the
+    segments do not change.
     """
     seeds = np.concatenate(
         [_crossings(rays[i], rays[j]) for i in range(len(rays)) for j in range(i + 1, len(rays))], axis=0
@@ -145,7 +146,7 @@ def _cost(rays: list[Polyline], points: Array) -> Array:
 
 
 def _nearest_to_lines(rays: list[Polyline], points: Array) -> Array:
-    """Points nearest to the lines, or where they end to the ends, of the pieces nearest to points of shape (n, 3)."""
+    """Points nearest to the lines, or at ends to the end points, of the segments nearest to points of shape (n, 3)."""
     matrix = np.zeros((len(points), 3, 3))
     target = np.zeros((len(points), 3))
     for ray in rays:
@@ -160,7 +161,7 @@ def _nearest_to_lines(rays: list[Polyline], points: Array) -> Array:
 
 
 def _crossings(one: Polyline, other: Polyline) -> Array:
-    """Midpoints between the nearest points of each piece of one ray and each of another, shape (n, 3), m."""
+    """Midpoints between the nearest points of each segment of one ray and each of another, shape (n, 3), m."""
     first, second = (n.ravel() for n in np.indices((len(one.length), len(other.length))))
     p, d, p_length = one.start[first], one.heading[first], one.length[first]
     q, e, q_length = other.start[second], other.heading[second], other.length[second]

@@ -1,4 +1,4 @@
-"""How far fixes are from the truth: uniform drops, simulated reports, errors beside the position error bound."""
+"""Position errors: uniform drops, simulated reports, errors and the position error bound."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from rayfix_tables.table import Table
 
 @dataclass(frozen=True, kw_only=True)
 class Drop:
-    """A true position [m], shape (3,), and the paths to it from every station that hears it."""
+    """A true position [m], shape (3,), and the paths from every station to which it is audible."""
 
     position: NDArray[np.float64]
     paths: Mapping[str, Paths]
@@ -29,16 +29,16 @@ class Drop:
 
 @dataclass(frozen=True, kw_only=True)
 class LocatedDrop:
-    """A drop, the fix of its report and the bound of what was reported.
+    """A drop, the fix of its report, and the bound of the report.
 
     Attributes
     ----------
     drop : Drop
-        With the reported path of each station only.
+        With only the reported path of each station.
     bound : float, m
-        Position error bound; infinite where the measurements do not determine a position.
+        Position error bound; infinite if the measurements do not determine a position.
     seconds : float
-        Time that the fix took.
+        Computing time of the fix.
     """
 
     drop: Drop
@@ -48,7 +48,7 @@ class LocatedDrop:
 
     @property
     def error(self) -> float:
-        """Distance of the fix from the truth, m; infinite where there is no position."""
+        """Distance of the fix from the truth, m; infinite without a position."""
         if self.fix.position is None:
             return float("inf")
         return float(np.linalg.norm(self.fix.position - self.drop.position))
@@ -56,18 +56,18 @@ class LocatedDrop:
 
 @dataclass(frozen=True, kw_only=True)
 class DropErrors:
-    """What became of drops.
+    """Results of drops.
 
     Attributes
     ----------
     error : ndarray of shape (n_drops,), m
-        Distance of the fix from the truth; inf where there was no fix.
+        Distance of the fix from the truth; inf without a fix.
     bound : ndarray of shape (n_drops,), m
-        Position error bound of the same measurements; inf where they do not determine a position.
+        Position error bound of the same measurements; inf if they do not determine a position.
     seconds : ndarray of shape (n_drops,)
-        Time that the fix took; 0 where no station heard the drop.
+        Computing time of the fix; 0 if the drop is audible to no station.
     status : tuple of str
-        Status of each fix; "unheard" where no station heard the drop.
+        Status of each fix; "unheard" if the drop is audible to no station.
     """
 
     error: NDArray[np.float64]
@@ -83,7 +83,7 @@ def clear_of_solids(free_space: FreeSpace, points: NDArray[np.float64], *, margi
     ----------
     points : ndarray of shape (n, 3), m
     margin : float, m
-        Distance along each axis that must be free too.
+        Distance along each axis that must also be free.
     """
     around = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * margin
     return np.asarray(free_space.contains(points[:, None, :] + around).all(axis=1))
@@ -95,12 +95,12 @@ def solver_of(table: Table, vertices: NDArray[np.float64] | None = None) -> Forw
     Parameters
     ----------
     vertices : ndarray of shape (n_vertices, 3), m, optional
-        Where the scene's vertices are instead of where the table has them.
+        Vertices that replace those of the table's scene.
     """
     propagation = table.site.document["propagation"]
     scene = table.scene
     permittivity = None
-    if propagation.get("reflection") == "itu":  # tables of before this key have none
+    if propagation.get("reflection") == "itu":  # older tables lack this key
         permittivity = face_permittivity(scene.face_materials, scene.materials, propagation["carrier_ghz"])
     return ForwardSolver.from_mesh(
         np.array(scene.vertices if vertices is None else vertices),
@@ -120,7 +120,7 @@ def drop_positions(
     Parameters
     ----------
     margin : float, m
-        Least distance, along each axis, from solids and the building's shell.
+        Smallest distance, along each axis, from solids and the building's shell.
     max_height : float, m
         Greatest z of a position.
     """
@@ -144,7 +144,7 @@ def drops_at(points: NDArray[np.float64], solver: ForwardSolver, stations: Seque
 def drop_uniformly(
     table: Table, count: int, rng: np.random.Generator, *, margin: float = 0.06, max_height: float = np.inf
 ) -> list[Drop]:
-    """Drop UEs uniformly into the free space and find the paths to them.
+    """Draw drops uniformly from the free space and find the paths to them.
 
     Parameters
     ----------
@@ -169,9 +169,9 @@ def locate_drop(
     Parameters
     ----------
     drop : Drop
-        Heard by at least one station.
+        Audible to at least one station.
     rule : {"strongest", "first", "random"}
-        Which path each station reports.
+        Rule by which each station selects the reported path.
     """
     reported = {name: paths.only(select_path(paths, rule, rng)) for name, paths in drop.paths.items()}
     report = parse_report(simulate_report(reported, noise, rng=rng, timing=timing))

@@ -1,9 +1,9 @@
-"""Position error bound: the accuracy that no unbiased estimator can beat, given it knows every path.
+"""Position error bound: the smallest error of unbiased estimators that know every path.
 
 A reflected path is a straight line to the *unfolded* point: the point mirrored back, from the last plane to
-the first, into the station's space. There the gradients of azimuth, zenith and length are the textbook ones;
-mirrored forward again they are gradients with respect to the point itself. The Fisher information sums their
-outer products over the stations,
+the first, into the station's space. There the gradients of azimuth, zenith and length are those of a straight line;
+mirrored forward again, they are gradients with respect to the point itself. The Fisher information sums their outer
+products over the stations,
 
     J = sum_i  g_az g_az^T / azimuth_stdev^2 + g_ze g_ze^T / zenith_stdev^2 + (time terms),
 
@@ -21,7 +21,7 @@ from rayfix_evaluation.truth.forward import Paths
 
 __all__ = ["information_bound", "path_gradients", "position_error_bound"]
 
-_SINGULAR = 1e-12  # least ratio of the eigenvalues of an information matrix that is inverted
+_SINGULAR = 1e-12  # smallest ratio of the eigenvalues of an information matrix that is inverted
 _SAME_PLACE = 1e-6  # m; the paths have to belong to the stations and the point
 
 
@@ -33,7 +33,7 @@ def path_gradients(paths: Paths, index: int) -> NDArray[np.float64]:
     paths : Paths
         Paths between a station and the point.
     index : int
-        Which of them.
+        Index of the path.
 
     Returns
     -------
@@ -45,7 +45,8 @@ def path_gradients(paths: Paths, index: int) -> NDArray[np.float64]:
     vertices = paths.vertices[index, : bounces + 2]
     segments = np.diff(vertices, axis=0)
     directions = segments / np.linalg.norm(segments, axis=1, keepdims=True)
-    # Product of the reflections from the station's end: this times the point's move is the unfolded point's.
+    # Product of the reflections from the station's end; it maps a displacement of the point to that of the unfolded
+    # point.
     mirrors = np.eye(3)
     for incoming, outgoing in itertools.pairwise(directions):
         normal = (outgoing - incoming) / np.linalg.norm(outgoing - incoming)
@@ -81,26 +82,26 @@ def position_error_bound(
     paths : sequence of Paths
         Paths of each station to the point.
     selected : sequence of int
-        Index of the path that each station reports, -1 if the station hears none.
+        Index of the path that each station reports, -1 if it has none.
     point : ndarray of shape (3,), m
         Position of the transmitter.
     noise : Noise
-        Standard deviations; that of the azimuth counts for the azimuth angle itself.
+        Standard deviations; that of the azimuth is of the angle itself, at any zenith.
     timing : {"none", "pt", "toa", "tdoa"}
-        Times that are known besides the angles. ``"toa"`` has one clock offset in common, whose information
-        is projected out (Schur complement); the differences of ``"tdoa"`` carry just as much information,
-        since the noise of their reference is in all of them.
+        Times that are measured in addition to the angles. ``"toa"`` has an unknown common clock offset, which is
+        projected out (Schur complement). The differences of ``"tdoa"`` have the same information, because all contain
+        the noise of the reference.
 
     Returns
     -------
     float
-        Square root of the trace of the inverse information, m; infinite if the measurements leave some
-        direction open.
+        Square root of the trace of the inverse information, m; infinite if the measurements leave a direction
+        undetermined.
 
     Raises
     ------
     ValueError
-        If the arguments do not belong together, or times are wanted and ``noise.range_stdev`` is None.
+        If the arguments are inconsistent, or times are measured and ``noise.range_stdev`` is None.
     """
     stations = np.asarray(station_positions, dtype=np.float64).reshape(-1, 3)
     target = np.asarray(point, dtype=np.float64)
@@ -129,7 +130,7 @@ def position_error_bound(
 def information_bound(
     information: NDArray[np.float64], lengths: Sequence[NDArray[np.float64]], noise: Noise, *, timing: Timing
 ) -> float:
-    """Bound from what angles say, and from the path lengths that times measure.
+    """Bound from the information of angles and the gradients of measured path lengths.
 
     Parameters
     ----------
@@ -143,12 +144,12 @@ def information_bound(
     Returns
     -------
     float
-        As of :func:`position_error_bound`, m.
+        As in :func:`position_error_bound`, m.
 
     Raises
     ------
     ValueError
-        If times are wanted and ``noise.range_stdev`` is None.
+        If times are measured and ``noise.range_stdev`` is None.
     """
     if timing != "none" and len(lengths):
         if noise.range_stdev is None:

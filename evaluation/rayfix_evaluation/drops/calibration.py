@@ -1,4 +1,4 @@
-"""Whether the stated uncertainty is right: how often ellipsoids hold the truth, and what is wrong otherwise."""
+"""Calibration of the stated uncertainty: how often ellipsoids contain the truth, and kinds of failures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from rayfix_evaluation.drops.accuracy import LocatedDrop
 from rayfix_service.fusion.posterior.fix import Candidate, Fix
 
 GROSS_BOUNDS, GROSS_ERROR = 5.0, 1.0
-"""A fix has failed grossly when its error is above this many bounds and above this many metres."""
+"""A fix is a gross failure if its error exceeds this many bounds and this many metres."""
 
 OPEN_BOUND = 10.0
-"""Where the bound is above this, m, the measurements do not determine a position and there is nothing to compare."""
+"""Above this bound, m, the measurements do not determine a position, and errors are not compared."""
 
 _RIVAL_PROBABILITY = 0.99
 
@@ -28,7 +28,7 @@ class Calibration:
     count : int
         Fixes with a position.
     covered : mapping of float to int
-        Fixes whose credible ellipsoid of that probability holds the truth.
+        Fixes with the truth in the credible ellipsoid of that probability.
     gross : int
         Gross failures.
     rival_right : int
@@ -45,18 +45,18 @@ class Calibration:
 
 
 def ellipsoid_holds(fix: Fix, probability: float, point: NDArray[np.float64]) -> bool:
-    """Whether the fix's credible ellipsoid of a probability holds a point of shape (3,), m; without a position, no."""
+    """Whether a fix's credible ellipsoid contains a point of shape (3,), m; False if the fix has no position."""
     return fix.regions is not None and fix.regions.ellipsoid(probability).holds(point)
 
 
 def calibrate(located: Sequence[LocatedDrop], probabilities: Sequence[float]) -> Calibration:
-    """Sum up how well the stated uncertainty of fixes fits their errors.
+    """Compare the stated uncertainty of fixes with their errors.
 
     Parameters
     ----------
     located : sequence of LocatedDrop
     probabilities : sequence of float
-        Of the ellipsoids, between 0 and 1.
+        Probabilities of the ellipsoids, between 0 and 1.
     """
     fixed = [item for item in located if item.fix.candidates]
     truth = [item.drop.position for item in fixed]
@@ -82,13 +82,13 @@ def calibrate(located: Sequence[LocatedDrop], probabilities: Sequence[float]) ->
 
 
 def wilson_interval(hits: int, total: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Interval of a binomial proportion (Wilson's score interval); (0, 1) of nothing.
+    """Interval of a binomial proportion (Wilson's score interval); (0, 1) if ``total`` is 0.
 
     Parameters
     ----------
     hits, total : int
     confidence : float
-        Probability with which the interval is to hold the proportion.
+        Probability that the interval contains the proportion.
     """
     if total == 0:
         return 0.0, 1.0
@@ -101,6 +101,6 @@ def wilson_interval(hits: int, total: int, confidence: float = 0.95) -> tuple[fl
 
 
 def _within(candidate: Candidate, probability: float, point: NDArray[np.float64]) -> bool:
-    """Whether a point lies in the ellipsoid that a Gaussian candidate fills with a probability."""
+    """Whether a point lies in the ellipsoid that contains a Gaussian candidate with a probability."""
     apart = point - candidate.position
     return bool(apart @ np.linalg.solve(candidate.covariance, apart) <= chi2.ppf(probability, 3))

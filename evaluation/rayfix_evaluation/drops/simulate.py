@@ -1,7 +1,7 @@
-"""Simulated reports: what stations would measure of the paths that the forward solver found.
+"""Simulated reports: measurements of the paths of the forward solver.
 
-A report is a ``dict`` as ``POST /v1/positions`` takes it (degrees and metres), so that one simulation serves
-the Python API, the service and the files on disk.
+A report is a ``dict`` as ``POST /v1/positions`` takes it (degrees and metres), and can be used with the Python API, the
+service and files.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,10 +16,10 @@ from rayfix_evaluation.truth.forward import Paths
 __all__ = ["Noise", "Rule", "Timing", "select_path", "simulate_report", "uniform_drops"]
 
 Rule = Literal["strongest", "first", "random"]
-"""Which path a station reports: of the largest gain, the shortest, or any alike."""
+"""Path that a station reports: the strongest, the shortest, or a random one."""
 
 Timing = Literal["none", "pt", "toa", "tdoa"]
-"""What is measured besides angles: nothing, propagation times, arrivals by an unknown clock, differences."""
+"""Measured times: none, propagation times, times of arrival with an unknown clock, or time differences."""
 
 _CLOCK_RANGE = 300.0  # m, one microsecond
 
@@ -31,11 +31,11 @@ class Noise:
     Attributes
     ----------
     azimuth_stdev : float, rad
-        Of the azimuth angle itself, at any zenith.
+        Standard deviation of the azimuth angle itself, at any zenith.
     zenith_stdev : float, rad
         Of the zenith angle.
     range_stdev : float or None, m
-        Of one time of arrival times the speed of light; None if no time is measured.
+        Standard deviation of one time of arrival times the speed of light; None if no time is measured.
 
     Raises
     ------
@@ -48,7 +48,7 @@ class Noise:
     range_stdev: float | None
 
     def __post_init__(self) -> None:
-        """Refuse deviations that cannot be."""
+        """Refuse invalid standard deviations."""
         for name in ("azimuth_stdev", "zenith_stdev", "range_stdev"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0.0):
@@ -63,9 +63,9 @@ def select_path(paths: Paths, rule: Rule, rng: np.random.Generator) -> int:
     paths : Paths
         At least one path.
     rule : {"strongest", "first", "random"}
-        Largest gain, smallest length, or each with the same probability.
+        Largest gain, smallest length, or each path with the same probability.
     rng : numpy.random.Generator
-        Drawn from once with the rule ``"random"``, not at all otherwise.
+        Used once with the rule ``"random"``, otherwise not at all.
 
     Returns
     -------
@@ -100,8 +100,8 @@ def simulate_report(
 ) -> dict[str, Any]:
     """Measure one path per station, with noise.
 
-    The draws from the generator depend neither on the deviations nor on the timing: with equal seeds, reports
-    of different settings have the same standardised noise, and their comparison less scatter.
+    The draws from the generator depend neither on the deviations nor on the timing: with the same seed, reports of
+    different settings have the same standardised noise, which reduces the scatter of comparisons.
 
     Parameters
     ----------
@@ -114,8 +114,8 @@ def simulate_report(
     rule : {"strongest", "first", "random"}
         Which path each station reports.
     timing : {"none", "pt", "toa", "tdoa"}
-        ``"pt"`` adds the length of each path; ``"toa"`` the same plus one clock offset of 0 to 300 m that all
-        share; ``"tdoa"`` the length differences to the first station heard, whose own noise is in them all.
+        ``"pt"`` adds the length of each path; ``"toa"`` the same plus a common clock offset of 0 to 300 m; ``"tdoa"``
+        the length differences to the first station with a path, which all contain that station's noise.
     target_id : str
         Name of the transmitter in the report.
     timestamp : str
@@ -129,7 +129,7 @@ def simulate_report(
     Raises
     ------
     ValueError
-        If times are wanted and ``noise.range_stdev`` is None, or there is no such timing or rule.
+        If times are measured and ``noise.range_stdev`` is None, or timing or rule is unknown.
     """
     if timing not in ("none", "pt", "toa", "tdoa"):
         raise ValueError(f"the timing is {timing!r}; use 'none', 'pt', 'toa' or 'tdoa'")
@@ -187,12 +187,12 @@ def simulate_report(
 
 
 def fold_direction(azimuth: float, zenith: float) -> tuple[float, float]:
-    """Bring angles that noise has pushed out of range back to the same direction.
+    """Convert angles that noise has moved out of range to the equivalent angles in range.
 
     Parameters
     ----------
     azimuth, zenith : float, rad
-        Any angles; a zenith beyond a pole means the other side of it.
+        Any angles; a zenith beyond a pole is a direction on the other side of it.
 
     Returns
     -------

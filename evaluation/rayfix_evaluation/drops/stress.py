@@ -1,4 +1,4 @@
-"""Reports and twins that are wrong: nonsense in a measurement, wrong deviations, turned stations, moved objects."""
+"""Wrong reports and twins: outliers, wrong standard deviations, rotated stations, moved objects."""
 
 import copy
 from typing import Any
@@ -11,13 +11,13 @@ from scipy.sparse.csgraph import connected_components
 from rayfix_tables.geometry.angles import angles_of, direction
 
 _TOUCHING = 0.02
-"""Parts of the scene whose boxes are this near to each other are one object, m."""
+"""Parts of the scene with boxes closer than this, m, are one object."""
 
 Document = dict[str, Any]
 
 
 def with_random_angle(report: Document, station_id: str, rng: np.random.Generator) -> Document:
-    """Copy a report with a station's angle of arrival drawn from all directions alike."""
+    """Copy a report with a station's angle of arrival drawn uniformly from all directions."""
     changed = copy.deepcopy(report)
     for measurement in changed["measurements"]:
         if measurement["type"] == "aoa" and measurement["station_id"] == station_id:
@@ -27,7 +27,7 @@ def with_random_angle(report: Document, station_id: str, rng: np.random.Generato
 
 
 def with_late_time(report: Document, station_id: str, delay: float) -> Document:
-    """Copy a report with everything that one station's clock reading went into late by ``delay`` [m]."""
+    """Copy a report with a delay [m] of one station's clock reading, in all measurements that use it."""
     changed = copy.deepcopy(report)
     for measurement in changed["measurements"]:
         if "range_m" in measurement and measurement["station_id"] == station_id:
@@ -39,7 +39,7 @@ def with_late_time(report: Document, station_id: str, delay: float) -> Document:
 
 
 def with_scaled_stdevs(report: Document, factor: float) -> Document:
-    """Copy a report that states its deviations wrong by a factor."""
+    """Copy a report with all stated standard deviations multiplied by a factor."""
     changed = copy.deepcopy(report)
     for measurement in changed["measurements"]:
         for key in ("azimuth_stdev_deg", "zenith_stdev_deg", "stdev_m"):
@@ -49,12 +49,12 @@ def with_scaled_stdevs(report: Document, factor: float) -> Document:
 
 
 def with_turned_stations(report: Document, angle: float, rng: np.random.Generator) -> Document:
-    """Copy a report of stations that are mounted turned.
+    """Copy a report with the angles of rotated stations.
 
     Parameters
     ----------
     angle : float, rad
-        By which each station is turned, about an axis of its own that is drawn from all directions alike.
+        Rotation of each station, about an axis that is drawn uniformly from all directions.
     """
     changed = copy.deepcopy(report)
     for measurement in changed["measurements"]:
@@ -93,11 +93,12 @@ def move_scene(
     vertices : ndarray of shape (n_vertices, 3), m
     faces : ndarray of int, shape (n_faces, 3)
     stations : ndarray of shape (n_stations, 3), m
-        The part of the mesh whose box holds them all is the building; the rest are objects, those that touch as one.
+        The part of the mesh with a box that contains all stations is the building; the rest are objects. Touching parts
+        are one object.
     objects : float, m
-        How far each object moves, in a horizontal direction of its own.
+        Displacement of each object, in a random horizontal direction.
     walls : float, m
-        How far each side of the building's box moves, inwards or outwards.
+        Displacement of each side of the building's box, inwards or outwards.
 
     Returns
     -------
@@ -129,7 +130,7 @@ def move_scene(
 
 
 def _parts(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Tell which connected part of the mesh each vertex belongs to, shape (n_vertices,)."""
+    """Label the connected part of the mesh of each vertex, shape (n_vertices,)."""
     _, place = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
     edges = place[np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])]
     size = int(place.max()) + 1

@@ -12,30 +12,30 @@ from rayfix_evaluation.paper.points import RayPoints
 from rayfix_evaluation.paper.selection import RelativeLength, select_by_length, select_tuples
 
 Order = Literal["select_first", "fit_first"]
-"""Which of Algorithm 1's steps 3 (select by propagation time) and 4 (fit by EM) comes first."""
+"""Order of Algorithm 1's steps 3 (select by propagation time) and 4 (fit by EM)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PaperSettings:
-    """How much work the paper's method does.
+    """Settings of the paper's method.
 
     Attributes
     ----------
     num_rays : int
-        Rays that are launched around a measured angle.
+        Number of rays that are launched around a measured angle.
     num_isotropic_rays : int
-        Rays that are launched where no angle was measured.
+        Number of rays that are launched in all directions if no angle was measured.
     step : float, m
-        Between the points of a ray.
+        Distance between the points of a ray.
     num_points : int
-        Points, or pairs of them, that the fit gets at most.
+        Largest number of points, or pairs of points, of a fit.
     num_components : int
-        Of each station's mixture.
+        Number of components of each station's mixture.
     order : {"select_first", "fit_first"}
     bins_per_stdev : int
-        Bins of path length in one deviation of a relative propagation time.
+        Bins of path length per standard deviation of a relative propagation time.
     most_products : int
-        Products of components that are kept after each station.
+        Number of products of components that are kept after each station.
     """
 
     num_rays: int = 500
@@ -54,19 +54,19 @@ def algorithm_1(
     settings: PaperSettings,
     rng: np.random.Generator,
 ) -> Mixture | None:
-    """Fit where one station's measurements say that the transmitter is.
+    """Fit a mixture over the position to one station's measurements.
 
     Parameters
     ----------
     points : RayPoints
-        Of the station's rays: steps 1 and 2.
+        Points on the station's rays, from steps 1 and 2.
     measured : (length, stdev) or None, m
-        Propagation time as a length, and its deviation.
+        Propagation time as a length, and its standard deviation.
 
     Returns
     -------
     Mixture or None
-        Over the position; None where no two points are left.
+        Over the position; None if fewer than two points are left.
     """
     seed = int(rng.integers(2**31))
     if measured is None:
@@ -87,7 +87,7 @@ def algorithm_2(
     settings: PaperSettings,
     rng: np.random.Generator,
 ) -> list[Mixture] | None:
-    """Fit where stations and their relative propagation times say that the transmitter is, a mixture for each station.
+    """Fit a mixture over the position for each station, given relative propagation times.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def algorithm_2(
     Returns
     -------
     list of Mixture or None
-        Of the reference and of each other station; None where no points' lengths agree with the times.
+        Of the reference and of each other station; None if no points' lengths agree with the times.
     """
     selected = _agreeing(reference, others, differences, settings, rng)
     if not len(selected[0]):
@@ -115,15 +115,15 @@ def algorithm_2_joint(
     settings: PaperSettings,
     rng: np.random.Generator,
 ) -> Mixture | None:
-    """Algorithm 2 with one fit for the pairs: over all stations' positions at once, cut to where they meet.
+    """Algorithm 2 with a joint fit of the pairs: over all stations' positions, conditioned on their equality.
 
-    Fitting the stations apart forgets which point of one station went with which of another. This does not, and so
-    tends to the exact posterior with many points and components. Parameters are those of :func:`algorithm_2`.
+    Separate fits lose the association of one station's points with another's. The joint fit keeps it, and converges to
+    the exact posterior with many points and components. Parameters are those of :func:`algorithm_2`.
 
     Returns
     -------
     Mixture or None
-        Over the position, all stations taken together.
+        Over the position, for all stations together.
     """
     selected = _agreeing(reference, others, differences, settings, rng)
     if not len(selected[0]):
@@ -154,7 +154,7 @@ def _fit(samples: NDArray[np.float64], settings: PaperSettings, seed: int) -> Mi
 
 
 def _thin(points: RayPoints, most: int, rng: np.random.Generator) -> RayPoints:
-    """Points, at most ``most`` of them, drawn without replacement."""
+    """Draw at most ``most`` points without replacement."""
     if len(points) <= most:
         return points
     return points.take(rng.choice(len(points), size=most, replace=False))

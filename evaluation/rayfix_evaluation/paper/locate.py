@@ -1,4 +1,4 @@
-"""A report located by the paper's method as it would run online: launch, select, fit, multiply, arg max."""
+"""The paper's method run online for a report: launch, select, fit, multiply, arg max."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ from rayfix_tables.table import Table
 
 @dataclass(frozen=True, kw_only=True)
 class PaperLocator:
-    """Answers reports by the paper's method.
+    """Locates reports by the paper's method.
 
     Attributes
     ----------
@@ -33,16 +33,16 @@ class PaperLocator:
 
     @classmethod
     def of_table(cls, table: Table, settings: PaperSettings | None = None) -> "PaperLocator":
-        """Locate in the scene and among the stations of a table."""
+        """Create the method for a table's scene and stations."""
         return cls(launcher=Launcher.of_table(table), site=table.site, settings=settings or PaperSettings())
 
     def locate(self, report: Report, rng: np.random.Generator) -> NDArray[np.float64] | None:
-        """Position of shape (3,), m, or None where no station's points agree with its measurements.
+        """Position of shape (3,), m, or None if no station's points agree with its measurements.
 
         Raises
         ------
         ReportError
-            When the paper's method does not know what is in the report.
+            When the report has measurements that the paper's method does not support.
         """
         mixtures = self.mixtures(report, rng)
         if not mixtures:
@@ -51,7 +51,7 @@ class PaperLocator:
         return arg_max(mixtures, product.mean)
 
     def mixtures(self, report: Report, rng: np.random.Generator) -> list[Mixture]:
-        """Mixture over the position that each station's measurements give."""
+        """Mixture over the position for each station's measurements."""
         sorted_report = sort_for_paper(report, self.site)
         directions, ranges = sorted_report.directions, sorted_report.ranges
         reference, differences = sorted_report.reference, sorted_report.differences
@@ -63,7 +63,7 @@ class PaperLocator:
             related_points = [points[name] for name in differences]
             fitted = algorithm_2(points[reference], related_points, list(differences.values()), self.settings, rng)
             if fitted is None:
-                related = []  # no lengths agree: what angles say is left
+                related = []  # no lengths agree: use the angles only
             else:
                 found.extend(fitted)
         for name in names:

@@ -1,4 +1,4 @@
-"""Gaussian mixtures fitted to points, their product, and where it is largest."""
+"""Gaussian mixtures fitted to points, their product, and its maximum."""
 
 import warnings
 from collections.abc import Sequence
@@ -11,10 +11,10 @@ from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
 _POINTS_PER_COMPONENT = 10
-"""A component has to stand for at least this many points."""
+"""Smallest number of points per component."""
 
 _FLOOR = 0.02
-"""Deviation that is added to every component's along each axis, m."""
+"""Standard deviation that is added to every component along each axis, m."""
 
 _MAX_ITERATIONS = 200
 
@@ -63,7 +63,7 @@ def fit_mixture(samples: NDArray[np.float64], num_components: int, seed: int) ->
     samples : ndarray of shape (n, d), m
         At least two.
     num_components : int
-        Fewer are fitted where there would be less than ten samples for each.
+        Fewer are fitted if there are fewer than ten samples for each.
     """
     num_components = max(1, min(num_components, len(samples) // _POINTS_PER_COMPONENT))
     model = GaussianMixture(num_components, reg_covar=_FLOOR**2, max_iter=_MAX_ITERATIONS, random_state=seed)
@@ -78,7 +78,7 @@ def fit_mixture(samples: NDArray[np.float64], num_components: int, seed: int) ->
 
 
 def condition_on_last(mixture: Mixture, value: float, variance: float) -> Mixture:
-    """Condition a mixture on a measurement of its last coordinate and leave that coordinate out.
+    """Condition a mixture on a measurement of its last coordinate, and remove that coordinate.
 
     Parameters
     ----------
@@ -97,12 +97,12 @@ def condition_on_last(mixture: Mixture, value: float, variance: float) -> Mixtur
 
 
 def where_all_meet(mixture: Mixture) -> Mixture:
-    """Cut a mixture over several positions (x1, x2, ...) to where they are one, x1 = x2 = ... = x.
+    """Condition a mixture over several positions (x1, x2, ...) on their equality, x1 = x2 = ... = x.
 
     Parameters
     ----------
     mixture : Mixture
-        Of dimension 3 times the number of positions.
+        Its dimension is 3 times the number of positions.
     """
     dimension = mixture.mean.shape[1]
     same = np.tile(np.eye(3), (dimension // 3, 1))
@@ -111,7 +111,7 @@ def where_all_meet(mixture: Mixture) -> Mixture:
     eta = np.einsum("ji,kjl,kl->ki", same, precision, mixture.mean)
     cov = np.asarray(np.linalg.inv(information), np.float64)
     mean = np.einsum("kij,kj->ki", cov, eta)
-    # The value of N(same x; mean, cov) at its largest, times the volume of a Gaussian of that width.
+    # The maximum of N(same x; mean, cov) over x, times the volume of a Gaussian of that width.
     height = _log_normal(mean @ same.T - mixture.mean, mixture.cov)
     log_volume = 0.5 * np.linalg.slogdet(2.0 * np.pi * cov)[1]
     return Mixture(log_weight=mixture.log_weight + height + log_volume, mean=mean, cov=cov)
@@ -125,7 +125,7 @@ def multiply(mixtures: Sequence[Mixture], most: int) -> Mixture:
     mixtures : sequence of Mixture
         At least one.
     most : int
-        Combinations that are kept after each factor, those of the largest weight.
+        Number of combinations that are kept after each factor, those with the largest weights.
     """
     product = mixtures[0]
     for factor in mixtures[1:]:

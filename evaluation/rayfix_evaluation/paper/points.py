@@ -1,7 +1,7 @@
-"""Points along rays: where a signal can have come from, each with the length of its path.
+"""Points along rays: candidate positions of the transmitter, each with its path length.
 
 Steps 1 and 2 of the paper's Algorithm 1: directions are drawn around the measured angle of arrival (or, without one,
-from all around the station), rays are launched and mirrored, and points are set along them at regular steps.
+from all directions), rays are launched and reflected, and points are placed along them at regular steps.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class RayPoints:
     ----------
     position : ndarray of shape (n, 3), m
     path_length : ndarray of shape (n,), m
-        From the station along the ray, reflections included.
+        Length from the station along the reflected ray.
     """
 
     position: NDArray[np.float64]
@@ -38,7 +38,7 @@ class RayPoints:
         return len(self.path_length)
 
     def take(self, index: NDArray[np.int64]) -> "RayPoints":
-        """Choose points, in the order of ``index``."""
+        """Select points, in the order of ``index``."""
         return RayPoints(position=self.position[index], path_length=self.path_length[index])
 
 
@@ -62,7 +62,7 @@ class Launcher:
 
     @classmethod
     def of_table(cls, table: Table) -> "Launcher":
-        """Launch in the scene that a table was built from, with its limits."""
+        """Create the launcher for a table's scene, with its limits."""
         propagation = table.site.document["propagation"]
         triangles = np.asarray(table.scene.vertices, np.float64)[table.scene.faces]
         corners = triangles.reshape(-1, 3)
@@ -91,12 +91,12 @@ class Launcher:
 
 
 def draw_directions(measured: Direction, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw launch directions from N(angle of arrival, R), or from all around where no angle was measured.
+    """Draw launch directions from N(angle of arrival, R), or uniformly if no angle was measured.
 
     Parameters
     ----------
     measured : Direction
-        With both angles or with none; in the scene frame.
+        Both angles or none; in the scene frame.
     count : int
 
     Returns
@@ -113,7 +113,7 @@ def draw_directions(measured: Direction, count: int, rng: np.random.Generator) -
         vectors = rng.standard_normal((count, 3))
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
     if measured.azimuth is None or measured.zenith is None:
-        raise ValueError("the paper's method takes azimuth and zenith or no angle; leave the single angle out")
+        raise ValueError("the paper's method needs azimuth and zenith or no angle; leave the single angle out")
     angles = rng.multivariate_normal([measured.azimuth, measured.zenith], measured.cov, size=count)
     return direction(angles[:, 0], angles[:, 1])
 
@@ -126,7 +126,7 @@ def points_on_rays(
     step: float,
     rng: np.random.Generator,
 ) -> RayPoints:
-    """Launch rays and set points along them.
+    """Launch rays and place points along them.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def points_on_rays(
     directions : ndarray of shape (n_rays, 3)
         Unit vectors.
     step : float, m
-        Between points of a ray; the first of each ray is a random part of it away from the station.
+        Distance between points of a ray; the first point is at a random fraction of it from the station.
     """
     segments = launcher.trace(station, directions)
     phase = step * rng.random(len(directions))

@@ -1,4 +1,4 @@
-"""A report as the paper's method takes it: one angle and one time of each station, times to one reference."""
+"""Reports in the form of the paper's method: one angle and one time per station, differences to one reference."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from rayfix_tables.site import SiteInfo, Station
 
 @dataclass(frozen=True, kw_only=True)
 class PaperReport:
-    """Measurements by station, the stations' biases taken off.
+    """Measurements by station, with the stations' biases subtracted.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class PaperReport:
     reference : str or None
         Station that the differences are relative to.
     differences : mapping of str to RelativeLength
-        Of each other station with a time.
+        Differences of all other stations with a time.
     """
 
     directions: Mapping[str, Direction]
@@ -46,12 +46,12 @@ def sort_for_paper(report: Report, site: SiteInfo) -> PaperReport:
     Raises
     ------
     ReportError
-        When a station is unknown, or the report holds what the paper's method does not know: a height, a signal
-        strength, errors that are not Gaussian, a lone azimuth, two measurements of a kind from one station, or time
-        differences to more than one reference.
+        When a station is unknown, or the report has data that the paper's method does not support: a height, a signal
+        strength, errors that are not Gaussian, an azimuth without a zenith, two measurements of a kind from one
+        station, or time differences to more than one reference.
     """
     if report.height is not None:
-        raise ReportError("the paper's method knows no height; leave it out", path=("height",))
+        raise ReportError("the paper's method does not support a height; leave it out", path=("height",))
     stations = {station.id: station for station in site.stations}
     directions: dict[str, Direction] = {}
     ranges: dict[str, tuple[float, float]] = {}

@@ -11,7 +11,7 @@ from rayfix_evaluation.paper.points import RayPoints
 
 @dataclass(frozen=True, kw_only=True)
 class RelativeLength:
-    """A relative propagation time (RPT) as a length: path length to a station less that to the reference.
+    """A relative propagation time (RPT) as a length: path length to a station minus that to the reference.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ def select_by_length(points: RayPoints, length: float, stdev: float, rng: np.ran
     Parameters
     ----------
     length, stdev : float, m
-        Measured path length and its deviation.
+        Measured path length and its standard deviation.
     """
     likelihood = np.exp(-0.5 * ((points.path_length - length) / stdev) ** 2)
     return points.take(np.flatnonzero(rng.random(len(points)) < likelihood))
@@ -44,10 +44,10 @@ def select_tuples(
     bins_per_stdev: int,
     rng: np.random.Generator,
 ) -> list[RayPoints]:
-    """Draw points of all stations whose length differences agree with the relative propagation times.
+    """Draw tuples of points of all stations with length differences that agree with the relative propagation times.
 
-    With one other station these are the pairs of Algorithm 2. Trying all pairs would cost the product of the numbers of
-    points; since the likelihood depends on the lengths alone, points are counted in bins of path length, bins are
+    With one other station these are the pairs of Algorithm 2. The cost of all pairs is the product of the numbers of
+    points. Because the likelihood depends only on the lengths, points are sorted into bins of path length; bins are
     drawn, and then a point from each bin.
 
     Parameters
@@ -59,15 +59,15 @@ def select_tuples(
     differences : sequence of RelativeLength
         One for each of ``others``.
     count : int
-        Tuples to draw.
+        Number of tuples to draw.
     bins_per_stdev : int
-        Bins are the smallest deviation divided by this wide.
+        The width of a bin is the smallest standard deviation divided by this.
 
     Returns
     -------
     list of RayPoints
-        ``count`` points of the reference and of each other station; those at one place belong together. All are empty
-        when no lengths agree.
+        ``count`` points of the reference and of each other station; points with the same index form a tuple. All are
+        empty if no lengths agree.
     """
     width = min(d.stdev for d in differences) / bins_per_stdev
     own = _Bins.of(reference.path_length, width)
@@ -112,6 +112,6 @@ class _Bins:
         )
 
     def draw(self, bins: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-        """Draw one point from each of the bins named."""
+        """Draw one point from each of the given bins."""
         step = (rng.random(len(bins)) * self.counts[bins]).astype(np.int64)
         return np.asarray(self.order[self.begins[bins] + step])

@@ -1,1 +1,1 @@
-"""Pictures of fixes and reports for papers, and the files that they are written to."""
+"""Pictures of fixes and reports for papers, and their files."""

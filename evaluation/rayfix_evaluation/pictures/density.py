@@ -1,4 +1,4 @@
-"""Gaussian mixtures on a grid of two coordinates, and the contours that hold a fraction of their mass."""
+"""Gaussian mixtures on a grid of two coordinates, and contours that contain a fraction of their mass."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ def marginal_density(
     cov : ndarray of shape (n, 3, 3), m2
     coordinates : tuple of 2 ints
     x, y : ndarray of shape (nx,) and (ny,), m
-        Of the grid, in the order of ``coordinates``.
+        Coordinates of the grid, in the order of ``coordinates``.
 
     Returns
     -------
@@ -40,7 +40,7 @@ def marginal_density(
 
 
 def credible_levels(density: NDArray[np.float64], shares: Sequence[float]) -> list[float]:
-    """Densities above which given shares of the mass on the grid lie, ascending; equal ones once.
+    """Density levels that enclose given fractions of the mass on the grid, ascending, without duplicates.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Shared by all pictures: orientation of a plan, allowed file names, and one clear error where writing fails."""
+"""Common parts of all pictures: orientation of a plan, allowed file names, and errors of writing."""
 
 from pathlib import Path
 
@@ -16,20 +16,20 @@ _DOTS_PER_INCH = 130
 
 
 def check_picture(path: Path) -> None:
-    """Refuse a name under which no picture can be written.
+    """Check that a picture can be written under a name.
 
     Raises
     ------
     RayfixError
-        When the type is unknown, or there is no such folder, or none to write in.
+        When the type is unknown, or the folder is missing or read-only.
     """
     if path.suffix.lower() not in TYPES:
-        raise RayfixError(f"{path} is no name of a picture; end it in {', '.join(TYPES[:-1])} or {TYPES[-1]}")
+        raise RayfixError(f"{path} is not a valid name of a picture; end it in {', '.join(TYPES[:-1])} or {TYPES[-1]}")
     check_folder(path, RayfixError)
 
 
 def set_plan_limits(axes: Axes, along: int, low: ArrayLike, high: ArrayLike) -> None:
-    """Show a floor from above: where y runs to the right, x runs down, or the plan would be a mirror image.
+    """Show a floor from above: if y runs to the right, x runs down, because the plan must not be mirrored.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def set_plan_limits(axes: Axes, along: int, low: ArrayLike, high: ArrayLike) -> 
 
 
 def save_picture(figure: Figure, path: str | Path) -> None:
-    """Write a figure; its file's suffix says the type.
+    """Write a figure; the suffix of its file is the type.
 
     Raises
     ------

@@ -52,7 +52,7 @@ class SceneFigure:
         path, document, truth
             As of :func:`plot_fix`.
         handles : sequence of Artist
-            Of the legend, before those of labelled drawings.
+            First entries of the legend, before labelled drawings.
         """
         found = self.views[0][0].get_legend_handles_labels()[0]
         entries = [*handles, *found]
@@ -73,7 +73,7 @@ def make_figure(table: Table) -> SceneFigure:
     """Draw the scene and its stations."""
     bounds = np.stack([table.scene.vertices.min(axis=0), table.scene.vertices.max(axis=0)])
     extent = bounds[1] - bounds[0]
-    # The longer horizontal axis runs to the right, so that a long hall fills a page.
+    # The longer horizontal axis runs to the right; a long hall then fills the page.
     along = int(np.argmax(extent[:2]))
     across = 1 - along
     margin = 0.04 * extent[along]
@@ -112,7 +112,7 @@ def plot_fix(
     Parameters
     ----------
     path : str or Path
-        Its suffix says the type: .png, .svg or .pdf.
+        The suffix is the type: .png, .svg or .pdf.
     document : mapping
         Answer of the HTTP interface.
     truth : array_like of shape (3,), optional
@@ -172,11 +172,11 @@ def _title(table: Table, document: Mapping[str, Any], truth: ArrayLike | None) -
 
 
 def _draw_scene(axes: Axes, table: Table, along: int, vertical: int) -> None:
-    """Shade every triangle faintly: solids show as their outline, the darker the more surfaces overlap."""
+    """Shade every triangle faintly: solids appear as outlines, darker where more surfaces overlap."""
     triangles = np.asarray(table.scene.vertices)[np.asarray(table.scene.faces)]
     extent = triangles.max(axis=(0, 1)) - triangles.min(axis=(0, 1))
     size = triangles.max(axis=1) - triangles.min(axis=1)
-    # The shell of the room would shade everything.
+    # The building's shell is left out, because it would shade everything.
     shell = np.all(size[:, [along, vertical]] > 0.9 * extent[[along, vertical]], axis=1)
     flat = triangles[~shell][:, :, [along, vertical]]
     axes.add_collection(PolyCollection(list(flat), facecolors=(0.43, 0.47, 0.53, 0.10), edgecolors="none"))

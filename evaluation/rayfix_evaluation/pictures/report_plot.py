@@ -49,19 +49,19 @@ def plot_report(
     Parameters
     ----------
     path : str or Path
-        Its suffix says the type: .png, .svg or .pdf.
+        The suffix is the type: .png, .svg or .pdf.
     locator : Locator
     report : Report
     document : mapping
         The fix, as the HTTP interface answers it.
     layers : collection of {"rays", "points", "mixture", "posterior", "fix"}
         "rays": drawn from the noise about each measured direction and mirrored; "points": on such rays, selected by the
-        station's propagation time as in the paper's Algorithm 1; "mixture": contours of what the table says of each
-        station's measurements; "posterior": of the position given all.
+        station's propagation time as in the paper's Algorithm 1; "mixture": contours of the table's mixture for each
+        station's measurements; "posterior": contours of the posterior of the position.
     truth : tuple of 3 floats, optional
         True position, m.
     seed : int
-        Of rays and points.
+        Seed of rays and points.
     """
     table = locator.table
     figure = make_figure(table)
@@ -100,7 +100,7 @@ def plot_report(
 
 
 def _heard_stations(table: Table, report: Report) -> list[tuple[str, Direction, Range | None]]:
-    """Stations that measured an angle, with the propagation time that they measured besides."""
+    """Stations that measured an angle, with their propagation time if they measured one."""
     stations = {station.id: station for station in table.site.stations}
     ranges = {m.station_id: m for m in report.measurements if isinstance(m, Range)}
     return [

@@ -1,4 +1,4 @@
-"""Floor plans: what a horizontal plane cuts of a scene."""
+"""Floor plans: the intersection of a scene with a horizontal plane."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

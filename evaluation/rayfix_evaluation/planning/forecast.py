@@ -21,33 +21,33 @@ from rayfix_tables.table import Table
 Array = NDArray[np.float64]
 
 Progress = Callable[[int, int], None]
-"""Called with the number of reports that are located, and with their total number."""
+"""Called with the number of reports located so far, and the total number."""
 
 _MARGIN = 0.06  # m; positions nearer to solids are left out
-_TRIES = 10  # positions that are tried for each that is drawn
+_TRIES = 10  # candidate positions for each position that is drawn
 _CLOCK = 100.0  # m; offset of a simulated clock
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanSettings:
-    """What is planned for.
+    """Settings of a forecast.
 
     Attributes
     ----------
     height : float, m
         z of the transmitters.
     noise : Noise
-        Standard deviations of what is measured.
+        Standard deviations of the measurements.
     timing : {"none", "pt", "toa", "tdoa"}
-        Times that are measured besides the angles.
+        Times that are measured in addition to the angles.
     spacing : float, m
         Side of the map's squares.
     threshold : float, m
-        Error above which a fix is of no use.
+        Largest useful error.
     draws : int
-        Reports from each square, each from another place in it and with its own noise.
+        Reports from each square, each from a different position in it and with different noise.
     seed : int
-        Of places and noise.
+        Seed of positions and noise.
 
     Raises
     ------
@@ -92,12 +92,12 @@ class PlanMap:
     position : ndarray of shape (n, 3), m
         Centres of the squares.
     audible : ndarray of shape (n, n_stations)
-        Fraction of a square's sampled positions that are audible to each station of the site.
+        Fraction of a square's sampled positions that is audible to each station of the site.
     bound : ndarray of shape (n,), m
-        Root mean square of the position error bounds of the reported paths; infinite where one of them leaves a
-        direction undetermined.
+        Root mean square of the position error bounds of the reported paths; infinite if one of them leaves a direction
+        undetermined.
     error : ndarray of shape (n,), m
-        Expected root mean square error, other candidates included; infinite where a report gives no fix.
+        Expected root mean square error, including other candidates; infinite if a report gives no fix.
     within : ndarray of shape (n,)
         Probability that the error is below the threshold.
     """
@@ -131,7 +131,7 @@ def forecast(table: Table, settings: PlanSettings, progress: Progress | None = N
     Raises
     ------
     RayfixError
-        If no place is free at this height.
+        If no position is free at this height.
     """
     rng = np.random.default_rng(settings.seed)
     squares, places = draw_places(table, settings.height, settings.spacing, settings.draws, rng)
@@ -148,7 +148,7 @@ def forecast(table: Table, settings: PlanSettings, progress: Progress | None = N
     middles, first = np.unique(squares, axis=0, return_index=True)
     shape = (len(middles), settings.draws)
     audible = np.stack([path.audible for path in paths], axis=1)
-    assert np.array_equal(first, np.arange(len(middles)) * settings.draws)  # squares come whole and in order
+    assert np.array_equal(first, np.arange(len(middles)) * settings.draws)  # squares are complete and in order
     return PlanMap(
         settings=settings,
         table_id=table.table_id,
@@ -163,20 +163,20 @@ def forecast(table: Table, settings: PlanSettings, progress: Progress | None = N
 def draw_places(
     table: Table, height: float, spacing: float, count: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Draw places from squares that tile a floor.
+    """Draw positions from squares that tile a floor.
 
     Parameters
     ----------
     height, spacing : float, m
     count : int
-        Places of each square.
+        Number of positions of each square.
 
     Returns
     -------
     squares : ndarray of shape (n * count, 3), m
         Centre of the square of each position, ascending.
     places : ndarray of shape (n * count, 3), m
-        In the free space. Squares that are hardly free are left out.
+        Positions in the free space. Squares with little free space are left out.
 
     Raises
     ------
@@ -212,7 +212,7 @@ def draw_places(
 
 
 def _bound(paths: Sequence[AudiblePaths], place: int, settings: PlanSettings) -> float:
-    """Bound as in :mod:`rayfix_evaluation.drops.bound`, from the gradients that the table gives."""
+    """Bound as in :mod:`rayfix_evaluation.drops.bound`, from gradients of the table."""
     noise = settings.noise
     information = np.zeros((3, 3))
     lengths = []
@@ -228,7 +228,7 @@ def _bound(paths: Sequence[AudiblePaths], place: int, settings: PlanSettings) ->
 
 
 def _outlook(locator: Locator, measurements: tuple[Measurement, ...], threshold: float) -> tuple[float, float]:
-    """Mean square error [m2] and probability of one below the threshold [m], as the posterior of a report says."""
+    """Mean square error [m2] and probability of an error below the threshold [m], by the posterior of a report."""
     regions = locator.locate(Report(measurements=measurements)).regions if measurements else None
     if regions is None:
         return float("inf"), 0.0
@@ -239,7 +239,7 @@ def _outlook(locator: Locator, measurements: tuple[Measurement, ...], threshold:
 def _measure(
     stations: Sequence[Station], paths: Sequence[AudiblePaths], place: int, settings: PlanSettings, errors: Array
 ) -> tuple[Measurement, ...]:
-    """Measurements from a place; ``errors`` in standard deviations, of shape (n_stations, 3)."""
+    """Measurements from a position; ``errors`` in standard deviations, of shape (n_stations, 3)."""
     noise, timing = settings.noise, settings.timing
     range_stdev = noise.range_stdev or 0.0
     measurements: list[Measurement] = []
@@ -282,7 +282,7 @@ def _measure(
 
 
 def summary(plan: PlanMap) -> dict[str, Any]:
-    """Figures of a map, JSON-compatible; None where a figure is infinite."""
+    """Summary of a map, JSON-compatible; None replaces infinity."""
     expected = np.quantile(plan.error, [0.5, 0.9], method="inverted_cdf")
     return {
         "table_id": plan.table_id,
@@ -297,5 +297,5 @@ def summary(plan: PlanMap) -> dict[str, Any]:
 
 
 def finite(value: float) -> float | None:
-    """Give a number as JSON can hold it: None for what is infinite."""
+    """Convert a number for JSON: None replaces infinity."""
     return float(value) if np.isfinite(value) else None

@@ -25,7 +25,7 @@ _INK, _SOLID, _PAPER, _NO_FIX = "#2b2f36", "#d9dbdf", "#ffffff", "#7a1f2b"
 
 @dataclass(frozen=True, kw_only=True)
 class _Quantity:
-    """What a panel shows, and in which colours."""
+    """Quantity and colours of a panel."""
 
     title: str
     label: str
@@ -59,7 +59,7 @@ def draw_plan(path: str | Path, table: Table, plan: PlanMap) -> None:
 
 
 def draw_comparison(path: str | Path, one: tuple[Table, PlanMap], other: tuple[Table, PlanMap]) -> None:
-    """Draw two tables' maps above each other, and what changes from the first to the second.
+    """Draw two tables' maps above each other, and the changes from the first to the second.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def _draw_panel(figure: Figure, axes: Axes, table: Table, plan: PlanMap, quantit
     corners, grid = _grid(plan, values, order)
     no_fix = np.isposinf(grid)
     if no_fix.any():
-        # Where a report gives no fix at all, no colour of the scale would be right.
+        # Squares without a fix are outside of the colour scale.
         axes.pcolormesh(*corners, np.ma.masked_where(~no_fix, np.ones_like(grid)), cmap=_one_colour(_NO_FIX))
     shown = np.ma.masked_invalid(grid)
     mesh = axes.pcolormesh(*corners, shown, cmap=quantity.cmap, norm=quantity.norm)
@@ -174,7 +174,7 @@ def _draw_panel(figure: Figure, axes: Axes, table: Table, plan: PlanMap, quantit
     for station in table.site.stations:
         spot = (station.position[along], station.position[1 - along])
         axes.plot(*spot, marker="^", markersize=8, color=_PAPER, markeredgecolor=_INK, linestyle="none")
-        # Towards the centre, where there is space.
+        # Labels are placed towards the centre, where there is space.
         right = spot[0] < 0.5 * (low + high)[along]
         up = (spot[1] < 0.5 * (low + high)[1 - along]) == (along == 0)
         axes.annotate(
@@ -197,7 +197,7 @@ def _draw_panel(figure: Figure, axes: Axes, table: Table, plan: PlanMap, quantit
 
 
 def _draw_solids(axes: Axes, table: Table, height: float, order: list[int]) -> None:
-    """Shade what is solid at this height."""
+    """Shade solids at this height."""
     free_space = table.scene.free_space
     layer = int((height - free_space.origin[2]) / free_space.voxel_size)
     blocked = ~np.asarray(free_space.free[:, :, layer])

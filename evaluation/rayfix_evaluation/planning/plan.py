@@ -31,7 +31,7 @@ def plan_settings(
     draws: int,
     seed: int,
 ) -> PlanSettings:
-    """Make settings of what the command line says: degrees, and metres.
+    """Make settings from arguments of the command line, in degrees and metres.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def plan_tables(
     opened = [open_checked(path) for path in tables]
     maps = []
     for table in opened:
-        with _bar(f"places of {table.path.name}", enabled=progress) as show:
+        with _bar(f"positions of {table.path.name}", enabled=progress) as show:
             maps.append((table, forecast(table, settings, show)))
     if len(maps) == 1:
         draw_plan(output, *maps[0])
@@ -76,7 +76,7 @@ def plan_tables(
 
 
 def plan_document(table: Table, plan: PlanMap) -> dict[str, Any]:
-    """Give a map as JSON-compatible data; None stands for what is infinite."""
+    """Return a map as JSON-compatible data; None replaces infinity."""
     settings = plan.settings
     return {
         "site": table.site.name,

@@ -1,9 +1,10 @@
-"""The path that a station would report from a position, according to the table itself.
+"""The path that a station most probably reports from a position, according to the table.
 
-The cells of a level hold the measure N(a; 0, W) s^2 pi dOmega ds, a density over places (docs/how-it-works.md): at a
-place x, a path k of direction a_k adds N(a_k - c; 0, W) pi_k to the density of the cell of centre c. So the cell whose
-density is the largest looks towards the path of the largest pi, which is the one most probably reported. The sum over
-all cells times their solid angles is the sum of pi: 1 where the position is audible to the station, 0 where it is not.
+The cells of a level contain the measure N(a; 0, W) s^2 pi dOmega ds, a density over positions (docs/how-it-works.md):
+at a position x, a path k with direction a_k adds N(a_k - c; 0, W) pi_k to the density of the cell with centre c. The
+cell with the largest density is therefore near the direction of the path with the largest pi, which is the most
+probable report. The sum over all cells times their solid angles is the sum of pi: 1 where the position is audible to
+the station, 0 where it is not.
 """
 
 from dataclasses import dataclass
@@ -20,27 +21,27 @@ from rayfix_tables.mixture import TubeMixture, joint_cov, unpack
 Array = NDArray[np.float64]
 
 AUDIBLE_ABOVE = 0.25
-"""Sum of the probabilities of a station's paths to a place above which the place is audible to it.
+"""A position is audible to a station if the sum of the probabilities of its paths exceeds this.
 
-Mixtures blur the edges of shadows: in the bundled hall the sum is above this at 19 of 20 places with a path, and below
+Mixtures blur shadow boundaries: in the bundled hall the sum is above this at 19 of 20 positions with a path, and below
 it at 9 of 10 without.
 """
 
-_REACH = 4.0  # standard deviations to which a component counts
-_FLOOR = 1e-3  # m, least standard deviation of a component along any axis
-_CHUNK = 100_000  # components whose matrices are unpacked at a time
+_REACH = 4.0  # standard deviations, reach of a component
+_FLOOR = 1e-3  # m, smallest standard deviation of a component along any axis
+_CHUNK = 100_000  # components that are unpacked at a time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AudiblePaths:
-    """The path of a station that is most probably reported from each of n places.
+    """The path that a station most probably reports from each of n positions.
 
     Attributes
     ----------
     probability : ndarray of shape (n,)
-        Sum of pi over all paths, about 1 where there are any.
+        Sum of pi over all paths; about 1 if there is one.
     azimuth, zenith : ndarray of shape (n,), rad
-        Of the reported path; zero where nothing is audible, as are the following.
+        Of the reported path; zero, like the following fields, at positions that are not audible.
     path_length : ndarray of shape (n,), m
     gradients : ndarray of shape (n, 3, 3), 1, rad and rad per m
         d(path length, tangent azimuth, zenith) / dx.
@@ -54,17 +55,17 @@ class AudiblePaths:
 
     @property
     def audible(self) -> NDArray[np.bool_]:
-        """Whether a place is audible to the station, shape (n,)."""
+        """Whether a position is audible to the station, shape (n,)."""
         return self.probability > AUDIBLE_ABOVE
 
 
 def audible_paths(level: Level, places: Array) -> AudiblePaths:
-    """Find the path that is most probably reported from each place.
+    """Find the path that is most probably reported from each position.
 
     Parameters
     ----------
     level : Level
-        The station's finest.
+        The station's finest level.
     places : ndarray of shape (n, 3), m
         In the table's frame.
     """
@@ -261,7 +262,7 @@ def _as_paths(level: Level, best: _Found) -> AudiblePaths:
     length = u[found, 0]
     predicted = {name: np.zeros(len(cell)) for name in ("azimuth", "zenith", "path_length")}
     predicted["azimuth"][found], predicted["zenith"][found], predicted["path_length"][found] = azimuth, zenith, length
-    # A turn of the tube's middle: what the reflections do to it is the same for the direction beside it.
+    # The tube's axes are rotated: the reflections act in the same way on a neighbouring direction.
     mirror = _turn(u_mean[found, 0], jacobian[found]) @ _frame(*_angles(u_mean[found], centres)).transpose(0, 2, 1)
     turn = mirror @ _frame(azimuth, zenith)
     gradients = np.zeros((len(cell), 3, 3))
@@ -276,17 +277,17 @@ def _angles(u: Array, centres: Array) -> tuple[Array, Array]:
 
 
 def _frame(azimuth: Array, zenith: Array) -> Array:
-    """Give the unit vectors of the direction and of growing azimuth and zenith, as columns, shape (n, 3, 3)."""
+    """Return the unit vectors of the direction and of increasing azimuth and zenith, as columns, shape (n, 3, 3)."""
     across = direction(azimuth + 0.5 * np.pi, np.full_like(azimuth, 0.5 * np.pi))
     return np.stack([direction(azimuth, zenith), across, direction(azimuth, zenith + 0.5 * np.pi)], axis=-1)
 
 
 def _turn(length: Array, jacobian: Array) -> Array:
-    """Turn, with reflections, from (length, angles) to the position; shape (n, 3, 3).
+    """Rotation, with reflections, from (length, angles) to the position; shape (n, 3, 3).
 
-    Of one reflection sequence dx/du is a turn times diag(1, length, length). That of a component, which may hold
-    several, is taken for the nearest of that form (the orthogonal Procrustes problem: P. H. Schoenemann, Psychometrika
-    31, 1966).
+    For one reflection sequence, dx/du is an orthogonal matrix times diag(1, length, length). A component can have
+    several; its jacobian is approximated by the nearest matrix of that form (the orthogonal Procrustes problem: P. H.
+    Schoenemann, Psychometrika 31, 1966).
     """
     left, _, right = np.linalg.svd(jacobian / _scale(length)[:, None, :])
     return np.asarray(left @ right)

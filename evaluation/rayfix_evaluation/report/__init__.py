@@ -1,1 +1,1 @@
-"""The report of an evaluation: figures, tables, and the page that holds them."""
+"""The report of an evaluation: figures, tables, and the HTML page."""

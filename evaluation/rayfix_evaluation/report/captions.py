@@ -1,4 +1,4 @@
-"""Captions of figures, from the results."""
+"""Captions of figures, generated from the results."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any

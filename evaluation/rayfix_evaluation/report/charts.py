@@ -104,7 +104,7 @@ def percentiles_chart(points: Sequence[Document]) -> Figure:
 
 
 def curve_chart(study: Document) -> Figure:
-    """Median and 90th percentile along a study's axis, or by its points where it has no axis."""
+    """Median and 90th percentile along a study's axis, or for its points if it has no axis."""
     figure = new_figure(5.0, 3.7)
     axes = figure.subplots()
     points = study["points"]
@@ -142,7 +142,7 @@ def curve_chart(study: Document) -> Figure:
 
 
 def reflections_chart(study: Document) -> Figure:
-    """Median and 90th percentile by how far the world has more reflections than the table."""
+    """Median and 90th percentile by the number of reflections that the world has more than the table."""
     figure = new_figure(5.0, 3.7)
     axes = figure.subplots()
     for place, point in enumerate(study["points"]):
@@ -204,7 +204,7 @@ def calibration_chart(curves: Sequence[tuple[str, Document, int]]) -> Figure:
 
 
 def differences_chart(document: Document) -> Figure:
-    """Table of differences of length of pairs of points, those that agree with the measured one marked."""
+    """Table of length differences of pairs of points; those that agree with the measured difference are marked."""
     difference, agrees = np.array(document["difference_m"]), np.array(document["agrees"], bool)
     rows, columns = difference.shape
     figure = new_figure(1.9 + 0.66 * columns, 1.3 + 0.36 * rows)
@@ -254,7 +254,7 @@ def _cdf(
 ) -> None:
     known = np.sort([e for e in errors if e is not None])
     share = np.arange(1, len(known) + 1) / len(errors)
-    # What has no position never adds up: the curve ends below 100 %.
+    # Drops without a position are not counted: the curve ends below 100 %.
     x = np.concatenate([[_LOW], np.clip(known, _LOW, _HIGH), [_HIGH]])
     y = np.concatenate([[0.0], share, share[-1:] if len(share) else [0.0]])
     axes.step(x, y, where="post", color=colour, linestyle=style, label=label, linewidth=width)
@@ -290,7 +290,7 @@ def _curve(axes: Axes, points: Sequence[tuple[float, Document]], colour: str) ->
 
 
 def _place_x(axes: Axes, places: Sequence[float]) -> None:
-    """Ticks where the points are; a logarithmic axis where each is a multiple of the one before."""
+    """Ticks at the points; a logarithmic axis if each is a multiple of the one before."""
     if min(places) > 0 and max(places) >= 8 * min(places):
         axes.set_xscale("log")
         axes.xaxis.set_minor_formatter(NullFormatter())

@@ -1,4 +1,4 @@
-"""All figures by name: what draws each and what it says beneath it."""
+"""All figures by name, with their drawing functions and captions."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -44,12 +44,12 @@ class Spec:
     Attributes
     ----------
     key : str
-        Name of its files.
+        Base name of its files.
     title, caption : str
     draw : callable
         Draws it.
     interactive : str or None
-        What the interactive picture of the same shows, where there is one.
+        Content of the interactive version, if there is one.
     """
 
     key: str
@@ -85,7 +85,7 @@ def write_figures(specs: Sequence[Spec], folder: Path, after: Callable[[int], No
     Parameters
     ----------
     after : callable
-        Called with the number of figures that are written.
+        Called with the number of figures written so far.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def write_figures(specs: Sequence[Spec], folder: Path, after: Callable[[int], No
 
 
 def interactive_figures(specs: Sequence[Spec], evaluation: Evaluation) -> dict[str, str]:
-    """JSON of the interactive pictures by the figures' keys."""
+    """JSON of the interactive pictures, by key of the figure."""
     scene = backdrop(evaluation.table)
     return {
         spec.key: space_figure(scene, evaluation.pictures, spec.interactive)

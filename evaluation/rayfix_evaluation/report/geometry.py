@@ -1,4 +1,4 @@
-"""The scene as pictures want it: its box, its objects, ellipsoids of mixtures."""
+"""Geometry for pictures of the scene: its box, its objects, ellipsoids of mixtures."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ __all__ = ["Backdrop", "backdrop", "ellipsoids", "unit_sphere"]
 Array = NDArray[np.float64]
 
 _MOST_TRIANGLES = 20_000
-"""Of larger scenes, the triangles of the largest area are drawn."""
+"""Largest number of triangles that are drawn, those with the largest areas."""
 
 _SHELL = 0.9
 """Triangles that span this fraction of the scene along two axes belong to the building's shell."""
@@ -24,14 +24,14 @@ _LEAST_WEIGHT = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class Backdrop:
-    """What everything is drawn in.
+    """The scene behind all pictures.
 
     Attributes
     ----------
     low, high : ndarray of shape (3,), m
         Corners of the scene.
     triangles : ndarray of shape (n, 3, 3), m
-        Of the objects in it, without the building's shell.
+        Triangles of the objects, without the building's shell.
     stations : dict of str to ndarray of shape (3,), m
     """
 
@@ -75,7 +75,7 @@ def unit_sphere(rings: int = 9, segments: int = 16) -> tuple[Array, NDArray[np.i
 
 
 def ellipsoids(mixture: Mapping[str, Any] | None) -> Iterator[tuple[float, Array, Array]]:
-    """Weight, centre [m] and square root of the covariance [m] of the components that weigh one per cent or more."""
+    """Weight, centre [m] and square root of the covariance [m] of components with a weight of at least one per cent."""
     if mixture is None:
         return
     for weight, mean, cov in zip(mixture["weight"], mixture["mean"], mixture["cov"], strict=True):

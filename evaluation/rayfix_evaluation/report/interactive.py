@@ -1,4 +1,4 @@
-"""Interactive pictures of space, by Plotly."""
+"""Interactive 3D pictures, by Plotly."""
 
 import json
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ _SOLID = "#9aa3af"
 
 
 def plotly_script() -> str:
-    """Source of Plotly's library, for one place in a page."""
+    """Source code of Plotly's library, to be included once in a page."""
     return str(get_plotlyjs())
 
 
@@ -92,7 +92,7 @@ def _solids(scene: Backdrop) -> Any:
 
 
 def _box(scene: Backdrop) -> Any:
-    # None between edges lifts the pen.
+    # None separates the line segments of edges.
     corners = np.round(scene.box_edges(), 3).tolist()
     x, y, z = ([value for edge in corners for value in (edge[0][axis], edge[1][axis], None)] for axis in range(3))
     line = {"color": _SOLID, "width": 2}

@@ -23,7 +23,7 @@ _TICKS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 
 def planning_chart(scene: Backdrop, planning: Document) -> Figure:
-    """Error to expect and probability of a useful fix over the floor, a column for each set of measurements."""
+    """Draw expected error and probability of a useful fix over the floor, a column for each set of measurements."""
     maps = planning["maps"]
     extent = scene.high - scene.low
     tall = extent[1] > extent[0]
@@ -55,7 +55,7 @@ def planning_chart(scene: Backdrop, planning: Document) -> Figure:
 
 
 def _draw(axes: Axes, planning: Document, plan: Document, name: str, scale: Normalize, along: int) -> Any:
-    """Draw squares as an image: what is not in the map stays empty."""
+    """Draw squares as an image; positions outside of the map remain empty."""
     spots, values = np.array(plan["position_m"]), np.array([np.nan if v is None else v for v in plan[name]])
     size = planning["spacing_m"]
     low = spots.min(axis=0)

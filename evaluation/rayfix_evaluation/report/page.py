@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing but itself; its templates are in ``templates``."""
+"""The report as one self-contained HTML page; its templates are in ``templates``."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -48,7 +48,7 @@ _SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Figure:
-    """A figure as the templates take it; ``data`` is the JSON of its interactive picture, where it has one."""
+    """A figure for the templates; ``data`` is the JSON of its interactive picture, if it has one."""
 
     key: str
     title: str
@@ -158,7 +158,7 @@ def _section(key: str, title: str, keys: tuple[str, ...], drawn: Mapping[str, _F
 
 
 def _stated_probabilities(study: Mapping[str, Any]) -> list[float]:
-    """Probabilities of the credible ellipsoids, from the first method that states any."""
+    """Probabilities of the credible ellipsoids, from the first method with a stated uncertainty."""
     coverages = (method["coverage"] for point in study["points"] for method in point["methods"].values())
     return [float(probability) for probability in next(coverage for coverage in coverages if coverage)]
 
@@ -222,7 +222,7 @@ def _made_rows(results: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _interval(values: Sequence[float | None]) -> str:
-    """Write the ends of a percentile's interval, given the percentile and the two."""
+    """Format the ends of a percentile's interval, given the percentile and both ends."""
     _, low, high = values
     if low is None or high is None:
         return ""

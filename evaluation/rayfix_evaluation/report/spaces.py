@@ -1,4 +1,4 @@
-"""Static pictures of space: the scene, points and mixtures in it, and rays in the plane."""
+"""Static 3D pictures of the scene with points and mixtures, and of rays in the plane."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -33,12 +33,12 @@ def space_picture(scene: Backdrop, pictures: Pictures, show: str) -> Figure:
     Parameters
     ----------
     show : {"scene", "points_aoa", "points_pt", "mixture_aoa", "mixture_pt"}
-        What is in it besides stations and the transmitter: the reported paths, points on rays, or fitted mixtures.
+        Content in addition to stations and transmitter: the reported paths, points on rays, or fitted mixtures.
     """
     width, height = 8.8, 4.6
     figure = new_figure(width, height)
     figure.set_layout_engine("none")
-    # A space is drawn into a square and cut at its sides: one as wide as the figure, more than as high.
+    # A 3D view is drawn into a square and clipped at its sides; the square is as wide as the figure, and higher.
     tall = width / height
     axes: Any = figure.add_axes((0.0, 0.5 - 0.5 * tall, 1.0, tall), projection="3d")
     extent = scene.high - scene.low
@@ -103,7 +103,7 @@ def plane_picture(scene: Backdrop, pictures: Pictures) -> Figure:
         rays = [np.array(ray)[:, pick] for ray in station["rays"]]
         axes.add_collection(LineCollection(rays, colors=colour, linewidths=0.5, alpha=0.28))
         points = np.array(station["plane_points"]).reshape(-1, 2)
-        # Crossings are (x, y), whichever runs along the page.
+        # Crossings are (x, y), whichever axis runs along the page.
         axes.plot(*points[:, pick].T, ".", color=colour, markersize=2.4, alpha=0.7, rasterized=True)
         if station["mixture_plane"] is not None:
             _contours(axes, station["mixture_plane"], grid, pick, colour)
@@ -124,7 +124,7 @@ def plane_picture(scene: Backdrop, pictures: Pictures) -> Figure:
 
 
 def _fit(axes: Any, extent: Array, corners: Array) -> None:
-    """Zoom and move a space so that its corners fill the figure above the legend."""
+    """Zoom and shift a 3D view to fill the figure above the legend."""
     axes.set_box_aspect(extent)
     for zoom in (1.0, None):
         x, y, _ = proj_transform(*corners.T, axes.get_proj())
@@ -154,7 +154,7 @@ def _contours(axes: Any, mixture: Any, grid: Array, pick: list[int], colour: str
         ordered = np.array(cov)[np.ix_(pick, pick)]
         square = np.einsum("...i,ij,...j->...", apart, np.linalg.inv(ordered), apart)
         density += weight * np.exp(-0.5 * square) / np.sqrt(np.linalg.det(2.0 * np.pi * ordered))
-    # Densities that hold 50, 80 and 95 % of the mixture.
+    # Density levels that enclose 50, 80 and 95 % of the mixture.
     falling = np.sort(density.ravel())[::-1]
     held = np.cumsum(falling) / falling.sum()
     levels = sorted({float(falling[np.searchsorted(held, share)]) for share in (0.5, 0.8, 0.95)})

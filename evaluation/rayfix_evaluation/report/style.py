@@ -1,4 +1,4 @@
-"""How figures look, and how they are written."""
+"""Style of figures, and writing their files."""
 
 import io
 import re
@@ -21,10 +21,10 @@ INK, MUTED, GRID, PAPER = "#23272f", "#6b7280", "#d8dce3", "#fffffe"
 _VARIABLES = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--rule)", PAPER: "none"}
 
 SERIES = ("#0f9d8f", "#3f7fd9", "#9b5de5", "#d1495b", "#e08a1e")
-"""Colours of a quantity that grows."""
+"""Colours of an ordered quantity."""
 
 _SCALE = 1.45
-"""Pixels of a page for a point of a figure, at most."""
+"""Largest number of pixels on the page per point of a figure."""
 
 STATIONS = ("#3f7fd9", "#e08a1e", "#1a936f", "#b5179e", "#8d6e63", "#00897b", "#c0392b", "#5e60ce")
 """Colours of stations, used again where there are more of them."""
@@ -76,7 +76,7 @@ _STYLE: dict[str, Any] = {
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of a size in inches; it takes its style from :func:`styled`."""
+    """Return an empty figure of a size in inches; call within :func:`styled`."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -88,7 +88,7 @@ def styled() -> AbstractContextManager[None]:
 
 
 def percent_axis(axes: Axes) -> None:
-    """Make the vertical axis one of shares, with lines at the median and the 90th percentile."""
+    """Format the vertical axis for fractions, with lines at the median and the 90th percentile."""
     axes.set_ylim(0.0, 1.0)
     axes.set_yticks([0.0, 0.25, 0.5, 0.75, 0.9, 1.0], ["0", "25", "50", "75", "90", "100 %"])
 
@@ -110,7 +110,7 @@ def write_figure(figure: Figure, stem: Path) -> None:
 
 
 def inline_svg(path: Path) -> str:
-    """SVG of a file for a page: without its header, in the colours of the page's scheme, with ids of its own."""
+    """SVG of a file for inclusion in a page: without header, with the page's colours and unique ids."""
     text = path.read_text(encoding="utf-8")
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)

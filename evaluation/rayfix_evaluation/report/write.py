@@ -1,4 +1,4 @@
-"""``rayfix evaluate``: run what is missing, then write figures, tables and the page."""
+"""``rayfix evaluate``: run the missing studies, then write figures, tables and the page."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,11 +31,11 @@ def run_evaluation(
     Parameters
     ----------
     table_path : Path, optional
-        The site's table; it is built when left out.
+        The site's table; built by default.
     quick : bool
         Few drops and wider windows for tables of other path priors.
     drops : int, optional
-        Drops of each study instead of the effort's own numbers.
+        Number of drops of each study, instead of the defaults.
     seed : int
         Zero or more.
     jobs : int

@@ -1,1 +1,1 @@
-"""What ``rayfix evaluate`` measures: cases, methods, studies, and how they are run, stored and summed up."""
+"""The measurements of ``rayfix evaluate``: cases, methods, studies, and their execution, storage and summary."""

@@ -1,4 +1,4 @@
-"""Angle errors of antenna arrays in a site: what reports and site files may state for each estimator."""
+"""Angle errors of antenna arrays in a site, as statistics for reports and site files."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ from rayfix_tables.site import Station
 
 __all__ = ["study_arrays"]
 
-_DRAWS = 11  # what a generator is for, as in rayfix_evaluation.studies.cases
+_DRAWS = 11  # purpose of a generator, as in rayfix_evaluation.studies.cases
 
 _STUDIES = {
     "4 x 4 antennas": ArrayStudy(
@@ -36,7 +36,7 @@ def study_arrays(drops: Sequence[Drop], stations: Sequence[Station], *, seed: in
     Returns
     -------
     list of dict
-        JSON-compatible, one for each size. An estimator with less than ten usable angles has errors and no statistics.
+        JSON-compatible, one for each size. An estimator with fewer than ten inliers has errors but no statistics.
         Angles in deg.
     """
     found = []

@@ -1,4 +1,4 @@
-"""Runs methods on the drops of cases; one for each process."""
+"""Runs methods on the drops of cases; each process has one bench."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,12 +24,12 @@ __all__ = ["Bench", "BenchSettings"]
 
 _PLACES, _SCENE, _METHOD = 0, 3, 9
 _MARGIN = 0.12
-"""Distance of drops from solids, m: moved objects must not bury them."""
+"""Smallest distance of drops from solids, m: moved objects must not cover them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchSettings:
-    """What makes a bench.
+    """Settings of a bench.
 
     Attributes
     ----------
@@ -37,9 +37,9 @@ class BenchSettings:
         Tables by variant.
     seed : int
     drops : int
-        Positions that are drawn. Each case takes the first of those that are audible to a station.
+        Number of positions that are drawn. Each case uses the first ones that are audible to a station.
     radio_map : RadioMap or None
-        Of the fingerprints, where they are among the methods.
+        Map of the fingerprints, if they are among the methods.
     """
 
     tables: Mapping[str, Path]
@@ -60,7 +60,7 @@ class Bench:
 
     @property
     def tools(self) -> Tools:
-        """What methods are made of."""
+        """Tools from which methods are made."""
         return Tools(tables=self.settings.tables, radio_map=self.settings.radio_map)
 
     @cached_property
@@ -80,7 +80,7 @@ class Bench:
         return self._drops[world, number]
 
     def heard(self, numbers: Sequence[int]) -> list[int]:
-        """Numbers of those drops that are audible to a station in a world that matches its twin."""
+        """Numbers of the drops that are audible to a station in a world that matches its twin."""
         return [n for n in numbers if self.drop(World(), n).paths]
 
     def run(self, case: Case, method: str, numbers: Sequence[int]) -> tuple[Run, NDArray[np.float64]]:
@@ -90,7 +90,7 @@ class Bench:
         -------
         run : Run
         seconds : ndarray of shape (n,)
-            Processor time that each answer took; 0 where there was no report.
+            Processor time of each answer; 0 without a report.
         """
         stations = self.table.site.stations
         answering = self._method(method)
@@ -145,5 +145,5 @@ class Bench:
 def _answer(answering: Answering, question: Question) -> Answer:
     try:
         return answering(question)
-    except ReportError:  # the method does not know what is in the report
+    except ReportError:  # the method does not support the report
         return Answer(position=None)

@@ -1,4 +1,4 @@
-"""A case: what the world is like, what is measured in it and how well, and what is wrong with it."""
+"""A case: the state of the world, the measurements and their accuracy, and disturbances."""
 
 import hashlib
 import json
@@ -26,21 +26,21 @@ from rayfix_tables.site import Station
 
 __all__ = ["Case", "Simulated", "World", "document_key", "in_view", "simulate_case"]
 
-# What a generator is for; the seed comes first and the number of the drop last.
+# Purposes of generators; the seed comes first and the number of the drop last.
 _NOISE, _TURN, _SELECT, _BLOCK, _ORDER, _BIAS, _SPOIL = 1, 2, 4, 5, 6, 7, 8
 
 _DELAY = 10.0
-"""How late a late time is, m."""
+"""Error of a delayed time, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """How the building differs from its twin.
+    """Differences between the building and its twin.
 
     Attributes
     ----------
     objects, walls : float, m
-        How far objects and outer walls are from where the twin has them.
+        Displacements of objects and outer walls from their positions in the twin.
     more_reflections : int
         Reflections of the longest paths beyond those in the table.
     """
@@ -59,28 +59,28 @@ class Case:
     angle_deg : float, deg
         Standard deviation of azimuth and zenith.
     timing : {"none", "pt", "toa", "tdoa"}
-        Times besides the angles. ``"tdoa"`` gives the paper's relative propagation times (RPT).
+        Times in addition to the angles. ``"tdoa"`` gives the paper's relative propagation times (RPT).
     range_stdev : float, m
-        Standard deviation of a time as a length; of a difference, where differences are measured.
+        Standard deviation of a time as a length, or of a difference if differences are measured.
     rule : {"strongest", "first", "random"}
-        Which path each station reports.
+        Rule by which each station selects the reported path.
     world : World
     heard : int or None
-        Stations that are left in the report, drawn anew for each drop; None for all.
+        Number of stations in the report, drawn for each drop; None for all.
     without : str or None
         A station that is out of service.
     blocked : float
-        Probability with which the direct path of a station is blocked.
+        Probability that the direct path of a station is blocked.
     told : float
-        Standard deviations in the report over the true ones.
+        Ratio of the standard deviations in the report to the true ones.
     bias_deg : float, deg
-        Offset of a station's azimuth and zenith, with signs that are drawn once for each station.
+        Bias of a station's azimuth and zenith, with signs that are drawn once for each station.
     turned_deg : float, deg
-        Angle by which stations are turned about axes drawn anew for each drop.
+        Angle by which stations are rotated about axes that are drawn for each drop.
     random_angles : int
-        Stations whose angle has nothing to do with the transmitter.
+        Number of stations that report a random angle.
     late_times : int
-        Stations whose time is 10 m late.
+        Number of stations that report a time 10 m too long.
     """
 
     angle_deg: float = 1.0
@@ -112,16 +112,16 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Simulated:
-    """A report and what is true of it.
+    """A report and its true properties.
 
     Attributes
     ----------
     report : dict
-        Body of ``POST /v1/positions``; without measurements where no station is left.
+        Body of ``POST /v1/positions``; without measurements if no station is left.
     bound : float, m
-        Position error bound of what was measured before anything was spoilt.
+        Position error bound of the measurements before disturbances.
     hidden : int
-        Stations in the report whose path is reflected.
+        Number of stations in the report with a reflected path.
     """
 
     report: Document
@@ -130,7 +130,7 @@ class Simulated:
 
 
 def document_key(document: Mapping[str, Any]) -> str:
-    """Return a name for settings: equal for equal ones only."""
+    """Return a hash of settings."""
     text = json.dumps(document, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -138,16 +138,16 @@ def document_key(document: Mapping[str, Any]) -> str:
 def simulate_case(case: Case, drop: Drop, number: int, stations: Sequence[Station], seed: int) -> Simulated:
     """Simulate the report of a drop.
 
-    With one seed, the same number has the same standardised noise in all cases.
+    With the same seed, a drop has the same standardised noise in all cases.
 
     Parameters
     ----------
     drop : Drop
-        With all paths of its world.
+        The drop with all paths of its world.
     number : int
-        Of the drop.
+        Number of the drop.
     stations : sequence of Station
-        Of the site.
+        Stations of the site.
     """
 
     def generator(purpose: int) -> np.random.Generator:
@@ -177,7 +177,7 @@ def simulate_case(case: Case, drop: Drop, number: int, stations: Sequence[Statio
 
 
 def in_view(station: Station, paths: Paths) -> Paths:
-    """Those paths that come from within a station's field of view."""
+    """Paths from within a station's field of view."""
     axis = board_to_scene(station)[:, 0]
     cosine = np.clip(direction(paths.azimuth, paths.zenith) @ axis, -1.0, 1.0)
     return _subset(paths, np.flatnonzero(np.arccos(cosine) <= 0.5 * station.field_of_view))
@@ -186,7 +186,7 @@ def in_view(station: Station, paths: Paths) -> Paths:
 def _reported(
     case: Case, drop: Drop, block_rng: np.random.Generator, select_rng: np.random.Generator
 ) -> dict[str, Paths]:
-    """Path that each station reports, of those that are not blocked."""
+    """Path that each station reports, of the paths that are not blocked."""
     reported = {}
     for name, paths in drop.paths.items():
         blocked = bool(block_rng.random() < case.blocked)
@@ -220,7 +220,7 @@ def _spoil(
     if case.turned_deg:
         turn = np.random.default_rng([seed, _TURN, number])
         report = with_turned_stations(report, float(np.deg2rad(case.turned_deg)), turn)
-    # What the site file says that a station measures wrongly, it does; the fusion takes it off again.
+    # Add the biases of the site file, which the fusion subtracts.
     offsets = {s.id: np.degrees([s.bias.azimuth, s.bias.zenith]) for s in stations}
     if case.bias_deg:
         signs = np.random.default_rng([seed, _BIAS]).choice([-1.0, 1.0], (len(stations), 2))
@@ -234,7 +234,7 @@ def _spoil(
 
 
 def _with_bias(report: Document, offsets: Mapping[str, NDArray[np.float64]]) -> Document:
-    """Copy a report with azimuths and zeniths off by an offset [deg] of each station's own."""
+    """Copy a report with a bias [deg] of each station's azimuths and zeniths."""
     measurements = []
     for m in report["measurements"]:
         if m["type"] == "aoa":

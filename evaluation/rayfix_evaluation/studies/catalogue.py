@@ -1,4 +1,4 @@
-"""The studies: which cases, by which methods, on how many drops."""
+"""The studies: their cases, methods and numbers of drops."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ RANGES = (0.2, 0.3, 0.5, 0.7, 1.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:
-    """How much is done.
+    """Size of an evaluation.
 
     Attributes
     ----------
     drops : int
-        Drops of the figures of the paper and of the methods side by side.
+        Drops for the paper's figures and the comparison of methods.
     stress_drops : int
         Drops of each point of a curve.
     array_drops : int
         Drops of the angle errors of antenna arrays.
     coarse : bool
-        Whether tables of other path priors have wide windows only.
+        Whether tables of other path priors have only wide windows.
     map_spacing : float, m
-        Of the map of fingerprints and of planning maps.
+        Spacing of the map of fingerprints and of planning maps.
     """
 
     name: str
@@ -46,7 +46,7 @@ FULL = Effort(name="full", drops=300, stress_drops=150, array_drops=60, coarse=F
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """One point of a study: its name, its place along the axis (if there is one), its case, and what locates it."""
+    """One point of a study: its name, its coordinate on the axis (if there is one), its case, and its methods."""
 
     label: str
     x: float | None = None
@@ -56,15 +56,15 @@ class Point:
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """Points that belong in one figure.
+    """Points of one figure.
 
     Attributes
     ----------
     key : str
-        In files.
+        Name in files.
     title : str
     axis : str
-        What ``Point.x`` is, with its unit; empty where points are not along an axis.
+        Label of ``Point.x`` with its unit; empty if the points have no axis.
     drops : int
     """
 
@@ -76,7 +76,7 @@ class Study:
 
 
 def methods_of(case: Case, keys: Sequence[str]) -> tuple[str, ...]:
-    """Those methods that can do something with what a case measures."""
+    """Methods that can use the measurements of a case."""
     return tuple(key for key in keys if case.timing in METHODS[key].timings)
 
 
@@ -87,7 +87,7 @@ def studies(effort: Effort, *, station_ids: Sequence[str], reflections: int) -> 
     ----------
     station_ids : sequence of str
     reflections : int
-        Of the longest paths in the table.
+        Largest number of reflections of paths in the table.
     """
     return (*_paper_figures(effort), _side_by_side(effort), *_stress(effort, station_ids, reflections))
 

@@ -32,26 +32,26 @@ from rayfix_tables.version import software_version
 __all__ = ["Evaluation", "Progress", "evaluate_site"]
 
 Progress = Callable[[str, int, int], None]
-"""Called with the stage, what of it is done, and all of it."""
+"""Called with the stage, the amount of work done, and the total amount."""
 
 _SPARE = 1.25
-"""Positions drawn for each drop, because some are audible to no station."""
+"""Candidate positions for each drop, because some are audible to no station."""
 
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "embreex", "trimesh", "h5py")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What an evaluation found.
+    """Result of an evaluation.
 
     Attributes
     ----------
     results : dict
-        The same for the same site, table, seed and version, as JSON-compatible data.
+        JSON-compatible data; equal for the same site, table, seed and version.
     timings : dict
-        Milliseconds of processor time that answers took; different each time.
+        Processor time of answers, ms; varies between runs.
     pictures : dict
-        Points, rays and mixtures of one report, for the pictures of it.
+        Points, rays and mixtures of one report, for pictures.
     table : Table
     """
 
@@ -71,12 +71,12 @@ def evaluate_site(
     jobs: int = -1,
     progress: Progress = lambda stage, done, total: None,
 ) -> Evaluation:
-    """Run everything that is not stored in a folder yet, and sum it up.
+    """Run everything that is not yet stored in a folder, and summarise the results.
 
     Parameters
     ----------
     folder : Path
-        Tables and finished runs are kept in ``work`` in it.
+        Tables and finished runs are stored in its subfolder ``work``.
     table_path : Path, optional
         The site's table; it is built when left out.
     seed : int
@@ -97,7 +97,7 @@ def evaluate_site(
         raise not_written(work, error) from error
     site_table = open_site_table(site_path, table_path, work / "tables", jobs=jobs, progress=progress)
     opened = open_checked(site_table, whole=False)
-    table = opened.in_table_frame  # fits of the methods beside rayfix would lose digits on map coordinates
+    table = opened.in_table_frame  # fits of the other methods would lose digits on map coordinates
     planned = studies(
         effort,
         station_ids=[station.id for station in table.site.stations],
@@ -161,7 +161,7 @@ def _arrays(bench: Bench, numbers: Sequence[int], seed: int) -> list[dict[str, A
 
 @dataclass(frozen=True, kw_only=True)
 class _Runner:
-    """Runs what is not stored."""
+    """Runs tasks without stored results."""
 
     settings: BenchSettings
     identities: Mapping[str, str]
@@ -171,7 +171,7 @@ class _Runner:
     progress: Progress
 
     def stored(self, kind: str, details: Mapping[str, Any], compute: Callable[[], Any]) -> Any:
-        """Return what is stored, or compute and store it."""
+        """Return a stored result, or compute and store it."""
         key = self._key(kind, details, [SITE])
         content = self.store.get(key)
         if content is None:
@@ -213,7 +213,7 @@ class _Runner:
         }
 
     def run_all(self, planned: Sequence[Study], heard: Sequence[int]) -> None:
-        """Run what is missing of all studies."""
+        """Run the missing parts of all studies."""
         missing = [task for task in _tasks(planned, heard) if self.store.get(self._run_key(task)) is None]
         weights = [METHODS[task.method].weight for task in missing]
         total = round(sum(weight * len(task.drops) for weight, task in zip(weights, missing, strict=True)))
@@ -248,7 +248,7 @@ class _Runner:
         }
 
     def study_document(self, study: Study, heard: Sequence[int]) -> dict[str, Any]:
-        """Everything about a study but how long it took."""
+        """Results of a study, without times."""
         points = []
         for point in study.points:
             methods = {}
@@ -269,7 +269,7 @@ class _Runner:
         return {"key": study.key, "title": study.title, "axis": study.axis, "points": points}
 
     def timing_document(self, study: Study, heard: Sequence[int]) -> dict[str, dict[str, dict[str, float]]]:
-        """Milliseconds of each point's methods."""
+        """Processor time of each point's methods, ms."""
         found: dict[str, dict[str, dict[str, float]]] = {}
         for point in study.points:
             found[point.label] = {}
@@ -308,7 +308,7 @@ class _Runner:
 
 
 def _tasks(planned: Sequence[Study], heard: Sequence[int]) -> list[Task]:
-    """Tasks of all studies, each once."""
+    """Tasks of all studies, without duplicates."""
     tasks = [
         _task(study, point.case, method, heard)
         for study in planned

@@ -1,7 +1,7 @@
 """The methods that are compared, in one registry.
 
-A method is made once for each process from its :class:`Tools` and then answers questions. What it cannot answer, a
-position being undetermined or a measurement unknown to it, it answers with no position.
+A method is made once per process from its :class:`Tools` and then locates reports. If the position is undetermined or a
+measurement is not supported, it returns no position.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,7 +42,7 @@ class Question:
     Attributes
     ----------
     truth : ndarray of shape (3,), m
-        True position, of which a method may look at what it is said to know.
+        True position, for methods that are given a part of it, such as the height.
     """
 
     report: Report
@@ -52,13 +52,13 @@ class Question:
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What a method says.
+    """Answer of a method.
 
     Attributes
     ----------
     position : ndarray of shape (3,), m, or None
     covered : tuple of bool or None
-        Whether the ellipsoids of ``COVERAGE`` hold the truth; None without a stated uncertainty.
+        Whether the ellipsoids of ``COVERAGE`` contain the truth; None without a stated uncertainty.
     """
 
     position: NDArray[np.float64] | None
@@ -70,14 +70,14 @@ Answering = Callable[[Question], Answer]
 
 @dataclass(frozen=True, kw_only=True)
 class Tools:
-    """What methods are made of.
+    """Data from which methods are made.
 
     Attributes
     ----------
     tables : mapping of str to Path
-        Tables by their variant; ``"site"`` is that of the site itself.
+        Tables by variant; ``"site"`` is that of the site itself.
     radio_map : RadioMap or None
-        Of the fingerprints; it takes longer to make than all answers, so that it is made once for all processes.
+        Map of the fingerprints. Making it takes longer than all answers; it is made once for all processes.
     """
 
     tables: Mapping[str, Path]
@@ -95,23 +95,23 @@ class Method:
     Attributes
     ----------
     key, label : str
-        In files, and for display.
+        Name in files, and for display.
     note : str
-        One sentence on what it does and knows.
+        One sentence on the method and its inputs.
     variant : str
-        Which table it needs.
+        Variant of the table that it needs.
     timings : frozenset of str
-        Times besides angles with which it can do something.
+        Times that it can use in addition to angles.
     calibrated : bool
         Whether it states an uncertainty that can be checked.
     weight : float
-        About how many times as long it takes as rayfix, for the progress bar.
+        Approximate time relative to rayfix, for the progress bar.
     needs_map : bool
         Whether it needs the map of fingerprints.
     compared : bool
-        Whether it is one of those side by side, and not there for a single study.
+        Whether it is in the comparison of methods, or only in a single study.
     make : callable
-        From tools to what answers.
+        Makes the method from tools.
     """
 
     key: str
@@ -146,7 +146,7 @@ def _rayfix(variant: str) -> Callable[[Tools], Answering]:
 
 
 def _from_reports(locate: Callable[[Report], NDArray[np.float64] | None]) -> Answering:
-    """Answer by what needs no more than the report."""
+    """Answer by a method that needs only the report."""
     return lambda question: Answer(position=locate(question.report))
 
 

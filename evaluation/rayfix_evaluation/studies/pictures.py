@@ -1,4 +1,4 @@
-"""What the pictures of one report show: rays, points on them, mixtures fitted to these, differences of length."""
+"""Data of the pictures of one report: rays, points on them, mixtures fitted to these, length differences."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,13 +20,13 @@ from rayfix_service.wire import parse_report
 
 __all__ = ["draw_pictures"]
 
-_DRAWS = 10  # what a generator is for, as in rayfix_evaluation.studies.cases
+_DRAWS = 10  # purpose of a generator, as in rayfix_evaluation.studies.cases
 _RAYS, _POINTS, _PLANE_POINTS = 14, 350, 250
 _ROWS = 9
 """Points of each station in the table of differences."""
 
 _LOOKED_AT = 60
-"""Drops among which the one of the pictures is looked for."""
+"""Number of drops from which the one of the pictures is selected."""
 
 Array = NDArray[np.float64]
 
@@ -37,8 +37,8 @@ def draw_pictures(bench: Bench, heard: Sequence[int], seed: int) -> dict[str, An
     Parameters
     ----------
     heard : sequence of int
-        Numbers of the audible drops. The pictures show the one of the first 60 that is audible to most stations, and of
-        these one that as few as possible, but one at least, see directly.
+        Numbers of the audible drops. Of the first 60, the pictures show the drop that is audible to most stations;
+        among these, the one with the fewest direct paths, but at least one.
 
     Returns
     -------
@@ -128,12 +128,12 @@ def _polylines(launcher: Launcher, origin: Array, measured: Direction, rng: np.r
 
 
 def _differences(clouds: dict[str, RayPoints], ranges: dict[str, tuple[float, float]] | Any) -> dict[str, Any] | None:
-    """Lengths of points of two stations and which pairs agree with the difference that was measured."""
+    """Path lengths of points of two stations, and which pairs agree with the measured difference."""
     if len(clouds) < 2:
         return None
     first, second = list(clouds)[:2]
     stdev = 0.5
-    # Rows and columns at uniform steps of length around the measured one, so that the band of agreement is in view.
+    # Rows and columns at uniform steps of length around the true lengths, to include the band of agreement.
     rows, columns = (ranges[name][0] + np.linspace(-2.0, 2.0, _ROWS) for name in (first, second))
     lengths = []
     for name, wanted in ((first, rows), (second, columns)):

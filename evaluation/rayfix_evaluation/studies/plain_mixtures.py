@@ -1,10 +1,10 @@
 """The paper's method from a plain table: nearest cell, no correction for the angle within it.
 
-The table is one of the paper's path prior. A station's mixture is that of the cell around its angle, of the level whose
-window is nearest to the stated standard deviation; the offset of the angle within its cell is not used. A propagation
-time conditions the stored mixture over (position, path length), the paper's Algorithm 1 with its steps 3 and 4
-exchanged; then the stations' mixtures are multiplied and the arg max is taken, as in the paper. Algorithm 2 needs
-points and has no such form, so relative times are refused.
+The table has the paper's path prior. A station's mixture is that of the cell at its angle, in the level with the window
+nearest to the stated standard deviation; the offset of the angle within its cell is not used. A propagation time
+conditions the stored mixture over (position, path length), the paper's Algorithm 1 with its steps 3 and 4 exchanged;
+then the stations' mixtures are multiplied and the arg max is taken, as in the paper. Algorithm 2 needs points and has
+no equivalent, so relative times are refused.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from rayfix_tables.mixture import joint_cov
 from rayfix_tables.table import Table
 
 _MOST_PRODUCTS = 1_000
-"""Products of components that are kept after each station."""
+"""Number of products of components that are kept after each station."""
 
 _LEAST_WEIGHT = 1e-6
 """Components whose weight is below this fraction of the largest in their mixture are left out."""
@@ -31,21 +31,21 @@ _LEAST_WEIGHT = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class PlainTableLocator:
-    """Answers reports from the nearest cells of a table."""
+    """Locates reports from the nearest cells of a table."""
 
     table: Table
 
     def locate(self, report: Report) -> NDArray[np.float64] | None:
-        """Position of shape (3,), m, or None where no ray comes from the measured directions.
+        """Position of shape (3,), m, or None if no ray arrives from the measured directions.
 
         Raises
         ------
         ReportError
-            When the report holds more than angles and propagation times.
+            When the report has other data than angles and propagation times.
         """
         found = sort_for_paper(report, self.table.site)
         if found.reference is not None:
-            raise ReportError("the paper's method from a plain table knows no relative times; leave them out")
+            raise ReportError("the paper's method from a plain table does not support relative times; leave them out")
         mixtures = []
         for name, direction in found.directions.items():
             mixture = self._mixture(self.table.levels(name), direction, found.ranges.get(name))
@@ -58,7 +58,7 @@ class PlainTableLocator:
     def _mixture(
         self, levels: Sequence[Level], direction: Direction, measured: tuple[float, float] | None
     ) -> Mixture | None:
-        """Mixture over the position that one station's nearest cell gives."""
+        """Mixture over the position from one station's nearest cell."""
         assert direction.azimuth is not None
         assert direction.zenith is not None
         stdev = float(np.linalg.det(direction.cov) ** 0.25)

@@ -13,13 +13,13 @@ from rayfix_tables.table import Table
 __all__ = ["plan_site"]
 
 _ABOVE_FLOOR = 1.0
-"""Height of the transmitters above the lowest free place, m; half the building's where that is lower than twice it."""
+"""Height of the transmitters above the lowest free position, m; in low buildings, half of the building's height."""
 
 _NOISE = Noise(azimuth_stdev=float(np.deg2rad(1.0)), zenith_stdev=float(np.deg2rad(1.0)), range_stdev=0.5)
 
 
 def plan_site(table: Table, *, spacing: float, seed: int) -> dict[str, Any]:
-    """Forecast fixes over a site's floor, with angles of 1 deg and with propagation times of 0.5 m besides.
+    """Forecast fixes over a site's floor, with angles of 1 deg, alone and with propagation times of 0.5 m.
 
     Parameters
     ----------

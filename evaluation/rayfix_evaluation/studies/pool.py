@@ -1,4 +1,4 @@
-"""Runs spread over processes; results do not depend on their number."""
+"""Parallel runs in processes; results do not depend on their number."""
 
 import os
 import pickle
@@ -22,17 +22,17 @@ from rayfix_tables.errors import RayfixError
 __all__ = ["Done", "Task", "end_with", "run_tasks"]
 
 _CHUNK = 10
-"""Drops that a process gets at a time."""
+"""Number of drops that a process receives at a time."""
 
 _WATCH_SECONDS = 1.0
-"""After so long at most, a process notices that its parent has ended."""
+"""Largest time until a process notices that its parent has ended, s."""
 
 _bench: Bench | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A method on the drops of a case.
+    """A method applied to drops of a case.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Done:
     Attributes
     ----------
     seconds : ndarray of shape (n_drops,)
-        Processor time that each answer took.
+        Processor time of each answer.
     """
 
     task: Task
@@ -68,7 +68,7 @@ def run_tasks(
     Parameters
     ----------
     jobs : int
-        Processes; -1 for one per core. With 1, everything happens in this one.
+        Processes; -1 for one per core. With 1, everything runs in this process.
     advance : callable
         Called with a method and the number of drops that it has located since the last call.
 
@@ -106,7 +106,7 @@ def run_tasks(
 
 
 def _gathered(parallel: Parallel, tasks: Sequence[Task], advance: Callable[[str, int], None]) -> Iterator[Done]:
-    """Run the tasks in pieces of a few drops, and put the pieces together again."""
+    """Run the tasks in chunks of a few drops, and combine the results."""
     pieces = [
         (number, begin, task.drops[begin : begin + _CHUNK])
         for number, task in enumerate(tasks)
@@ -127,12 +127,12 @@ def _gathered(parallel: Parallel, tasks: Sequence[Task], advance: Callable[[str,
 
 
 def end_with(process: int) -> None:
-    """End this process when its parent has ended, in whatever way: its results have no receiver then.
+    """End this process when its parent has ended for any reason, because nothing receives the results.
 
     Parameters
     ----------
     process : int
-        Number of the parent.
+        Process number of the parent.
     """
 
     def watch() -> None:

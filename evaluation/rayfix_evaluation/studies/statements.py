@@ -1,4 +1,4 @@
-"""The paper's statements, checked on what was measured."""
+"""The paper's statements, checked on the measured results."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Statement:
     method : str
     holds : bool
     figures : str
-        What was measured.
+        Measured values.
     reason : str
         Why it does not hold, or a remark; may be empty.
     """

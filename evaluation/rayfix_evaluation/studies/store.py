@@ -1,4 +1,4 @@
-"""Results on disk: whatever is finished is kept, and a run that finds it does not do it again."""
+"""Results on disk: finished results are stored, and later runs reuse them."""
 
 import ast
 import errno
@@ -22,17 +22,17 @@ from rayfix_tables.errors import RayfixError
 __all__ = ["Store", "code_digest", "not_written", "write_bytes", "write_json", "write_text"]
 
 _NOT_NUMERIC = ("report", "pictures", "http", "server", "web", "adapters", "__pycache__")
-"""Folders whose code does not change a number."""
+"""Folders with code that does not affect results."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Store:
-    """A folder of finished results, each named by the settings that it came from."""
+    """A folder of finished results, each named by a hash of its settings."""
 
     folder: Path
 
     def get(self, settings: Mapping[str, Any]) -> Any | None:
-        """Return what is stored for settings, or None. A file that is not whole counts as missing."""
+        """Return the stored result of settings, or None. An incomplete file counts as missing."""
         try:
             entry = json.loads(self._path(settings).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -40,7 +40,7 @@ class Store:
         return entry["content"] if isinstance(entry, dict) and entry.get("settings") == _plain(settings) else None
 
     def put(self, settings: Mapping[str, Any], content: Any) -> None:
-        """Store what settings gave.
+        """Store the result of settings.
 
         Raises
         ------
@@ -54,7 +54,7 @@ class Store:
 
 
 def write_json(path: Path, document: Any, *, indent: int | None = 1) -> None:
-    """Write a document beside its place and rename it.
+    """Write a document to a temporary file and rename it.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def write_json(path: Path, document: Any, *, indent: int | None = 1) -> None:
         When it cannot be written.
     """
     text = json.dumps(document, indent=indent, allow_nan=False)
-    # Rows of numbers on one line each, or a page of results has a hundred thousand lines.
+    # Rows of numbers are written on one line each; otherwise the file would have a hundred thousand lines.
     text = re.sub(r"\[\s+([^\[\]{}\"]+?)\s+\]", lambda row: "[" + re.sub(r"\s+", " ", row[1]) + "]", text)
     write_text(path, text + "\n")
 
@@ -104,9 +104,9 @@ def not_written(path: Path, error: OSError) -> RayfixError:
 
 @cache
 def code_digest() -> str:
-    """Return a checksum of the code that numbers come from: results of other code are not its own.
+    """Return a checksum of the code that affects results; results of other code are not reused.
 
-    Comments, docstrings and layout do not count.
+    Comments, docstrings and layout are ignored.
     """
     digest = hashlib.sha256()
     for package in (rayfix_tables, rayfix_offline, rayfix_service, rayfix_evaluation):
@@ -119,7 +119,7 @@ def code_digest() -> str:
 
 
 def meaning(source: str) -> bytes:
-    """Return what a module's source does, without its comments, docstrings and layout."""
+    """Return a module's syntax tree as text, without comments, docstrings and layout."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):

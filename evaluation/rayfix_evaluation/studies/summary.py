@@ -1,4 +1,4 @@
-"""Runs summed up: percentiles with bootstrap intervals, failures, calibration."""
+"""Summaries of runs: percentiles with bootstrap intervals, failures, calibration."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from rayfix_evaluation.drops.calibration import GROSS_BOUNDS, GROSS_ERROR, OPEN_
 
 PERCENTILES = (50, 68, 90, 95)
 COVERAGE = (0.5, 0.68, 0.9, 0.99)
-"""Probabilities of the ellipsoids that calibration looks at."""
+"""Probabilities of the ellipsoids of the calibration."""
 
 _RESAMPLES = 1000
 _CONFIDENCE = 95.0
@@ -19,18 +19,18 @@ _CONFIDENCE = 95.0
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """What a method made of the drops of a case.
+    """Results of a method on the drops of a case.
 
     Attributes
     ----------
     error : ndarray of shape (n,), m
-        Distance from the truth; inf where the method had no position.
+        Distance from the truth; inf without a position.
     bound : ndarray of shape (n,), m
-        Position error bound; inf where the measurements do not determine a position.
+        Position error bound; inf if the measurements do not determine a position.
     hidden, heard : ndarray of int of shape (n,)
-        Stations in the report whose path is reflected, and all of them.
+        Number of stations in the report with a reflected path, and of all.
     covered : ndarray of bool of shape (n, 4) or None
-        Whether the ellipsoids of ``COVERAGE`` hold the truth; None for a method without a stated uncertainty.
+        Whether the ellipsoids of ``COVERAGE`` contain the truth; None for a method without a stated uncertainty.
     """
 
     error: NDArray[np.float64]
@@ -51,7 +51,7 @@ class Run:
 
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "Run":
-        """Read what :meth:`document` wrote."""
+        """Restore a run from the data of :meth:`document`."""
         covered = document["covered"]
         return cls(
             error=_lengths(document["error_m"]),
@@ -63,7 +63,7 @@ class Run:
 
     @classmethod
     def joined(cls, parts: Sequence["Run"]) -> "Run":
-        """Return the drops of all parts, in their order."""
+        """Concatenate the drops of all parts."""
         covered = [part.covered for part in parts if part.covered is not None]
         return cls(
             error=np.concatenate([part.error for part in parts]),
@@ -80,25 +80,25 @@ class Run:
 
     @property
     def gross(self) -> NDArray[np.bool_]:
-        """Whether a position is off by more than five bounds and more than a metre."""
+        """Whether an error exceeds five bounds and a metre."""
         return self.answered & (self.error > GROSS_BOUNDS * self.bound) & (self.error > GROSS_ERROR)
 
 
 def percentile(values: NDArray[np.float64], percent: float) -> float:
-    """Smallest value that the given percentage does not exceed; inf where too many values are."""
+    """Smallest value that the given percentage does not exceed; inf if too many values are infinite."""
     return float(np.percentile(values, percent, method="inverted_cdf"))
 
 
 def resampled(values: NDArray[np.float64], percent: float, seed: int) -> NDArray[np.float64]:
-    """Percentiles of samples drawn with replacement, shape (1000,); equal seeds draw the same drops."""
+    """Percentiles of samples drawn with replacement, shape (1000,); the same seed draws the same drops."""
     return np.asarray(np.percentile(values[_draws(len(values), seed)], percent, axis=1, method="inverted_cdf"))
 
 
 def summarise(run: Run, seed: int) -> dict[str, Any]:
-    """Sum a run up as JSON-compatible data.
+    """Summarise a run as JSON-compatible data.
 
-    Percentiles are of all drops, those without a position counting as infinitely far, with the bootstrap's 95 %
-    interval. Failures are gross errors and missing positions.
+    Percentiles are over all drops, with an infinite error for those without a position, and have bootstrap 95 %
+    intervals. Failures are gross errors and missing positions.
     """
     draws = _draws(len(run.error), seed)
     tail = 50.0 - 0.5 * _CONFIDENCE

@@ -1,4 +1,4 @@
-"""Tables that an evaluation needs besides the site's own: of other path priors and of fewer reflections."""
+"""Additional tables of an evaluation: with other path priors and with fewer reflections."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -20,13 +20,13 @@ SITE = "site"
 """The table of the site file itself."""
 
 _COARSE = 2.0
-"""Factor by which the finest window of other tables is wider where they are coarse."""
+"""Factor by which the finest window of coarse tables is wider."""
 
 Progress = Callable[[str, int, int], None]
 
 
 def open_site_table(site_path: Path, table_path: Path | None, folder: Path, *, jobs: int, progress: Progress) -> Path:
-    """Return the path of the site's table: the given one if it is of this site, or one that is built into a folder.
+    """Return the path of the site's table: the given one, if it is of this site, or one that is built in a folder.
 
     Raises
     ------
@@ -57,12 +57,12 @@ def open_site_table(site_path: Path, table_path: Path | None, folder: Path, *, j
 def build_variants(
     site_path: Path, folder: Path, names: Sequence[str], *, coarse: bool, jobs: int, progress: Progress
 ) -> dict[str, Path]:
-    """Build variants of a site's table into a folder; what is there already is kept.
+    """Build variants of a site's table in a folder; existing ones are kept.
 
     Parameters
     ----------
     names : sequence of str
-        Path priors, and ``"fewer-1"`` and so on for fewer reflections. These have one window only.
+        Path priors, and ``"fewer-1"`` and so on for fewer reflections. These have a single window.
     coarse : bool
         Whether the finest window is twice as wide as the site's.
 
@@ -99,7 +99,7 @@ def _variant(site: SiteFile, site_path: Path, name: str, coarse: bool) -> dict[s
 
 
 def _difference(wanted: Any, found: Any, where: str = "") -> str | None:
-    """Say which key differs first, or None."""
+    """Describe the first key that differs; None if there is none."""
     if isinstance(wanted, dict) and isinstance(found, dict):
         for key in wanted | found:
             different = _difference(wanted.get(key), found.get(key), f"{where}.{key}".lstrip("."))

@@ -1,12 +1,12 @@
 """Ground truth: every specular path between a station and a point (image method with visibility).
 
-Shares no code with the ray launcher, so that each can be tested against the other. Angles, lengths and frames
+It shares no code with the ray launcher, which permits testing each against the other. Angles, lengths and frames
 are those of ``docs/conventions.md``.
 
-A path leaves the station, is mirrored at up to ``max_reflections`` planes and ends at the point. Coplanar
-triangles are one mirror; it reflects on both sides, but only where a triangle is. A path exists when every
-bounce hits a triangle of its plane, the vertices before and after the bounce lie on the same side of it, and
-no triangle crosses a segment between its ends.
+A path leaves the station, is reflected at up to ``max_reflections`` planes and ends at the point. Coplanar triangles
+are one mirror; it reflects on both sides, but only inside its triangles. A path exists when every bounce hits a
+triangle of its plane, the vertices before and after the bounce lie on the same side of it, and no triangle crosses a
+segment between its ends.
 """
 
 from dataclasses import dataclass, fields
@@ -37,8 +37,7 @@ class Paths:
     num_reflections : ndarray of int of shape (n_paths,)
         Number of bounces; 0 is the line of sight.
     gain_db : ndarray of shape (n_paths,), dB
-        Power gain relative to one metre of free space: ``-20 log10(path_length)`` less the loss of the
-        bounces.
+        Power gain relative to one metre of free space: ``-20 log10(path_length)`` minus the loss of the bounces.
     vertices : ndarray of shape (n_paths, max_reflections + 2, 3), m
         Station, reflection points, point; unused rows repeat the point.
     """
@@ -55,7 +54,7 @@ class Paths:
         return len(self.path_length)
 
     def only(self, index: int) -> "Paths":
-        """Leave one path, as a set of its own."""
+        """Select one path, as a set with one element."""
         return Paths(**{field.name: getattr(self, field.name)[index : index + 1] for field in fields(self)})
 
 
@@ -74,8 +73,8 @@ class ForwardSolver:
     reflection_loss_db : float
         Loss of each bounce, dB.
     triangle_permittivity : ndarray of complex of shape (n_triangles,) or None
-        Complex relative permittivity of the scene's triangles; NaN where each bounce has the constant loss, and
-        None where all have it.
+        Complex relative permittivity of the scene's triangles; NaN for triangles with the constant loss, None if all
+        have it.
     """
 
     scene: MirrorScene
@@ -190,7 +189,7 @@ class ForwardSolver:
         return self.station(station).paths(point)
 
     def line_of_sight(self, station: ArrayLike, points: ArrayLike) -> NDArray[np.bool_]:
-        """Tell which points nothing hides from a station, whatever their distance.
+        """Find the points with a line of sight to a station, at any distance.
 
         Parameters
         ----------
@@ -239,7 +238,7 @@ class StationSolver:
         -------
         Paths
             Sorted by descending gain; empty if there is none. A point within a micrometre of the station has
-            no direct path, since that would have no direction.
+            no direct path, because its direction would be undefined.
         """
         solver = self.solver
         end = _position(point, "point")

@@ -3,12 +3,12 @@
 They work on the named tuples of :mod:`rayfix_evaluation.truth.images`. A side of a plane is the sign of the
 distance along its normal. The tolerances:
 
-- ``SIDE_MARGIN``: a vertex next to a bounce has to be this far off the mirror, so that a path through the
-  very edge between two walls is none;
-- ``END_MARGIN``: an obstacle that close to an end of a segment does not block it. Triangles of the mirrors at
-  the segment's ends never do, however flat the path leaves them;
-- ``EDGE_TOLERANCE``: triangles count as that much larger, so that a hit on an edge is found (and once only,
-  since sequences of planes are counted, not triangles).
+- ``SIDE_MARGIN``: a vertex next to a bounce must be this far off the mirror, which excludes paths through the edge
+  between two walls;
+- ``END_MARGIN``: an obstacle this close to an end of a segment does not block it. Triangles of the mirrors at the
+  segment's ends never block it, even at grazing incidence;
+- ``EDGE_TOLERANCE``: triangles are enlarged by this, to find hits on edges. They are found only once, because sequences
+  of planes are counted, not of triangles.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from rayfix_evaluation.truth.mirrors import ImageTree, MirrorScene
 
 SIDE_MARGIN = 1e-6
-"""Least distance [m] of a path's vertex from the mirror before or after it."""
+"""Smallest distance [m] of a path's vertex from the mirror before or after it."""
 END_MARGIN = 1e-6
-"""Stretch [m] at both ends of a segment where nothing blocks it."""
+"""Length [m] at both ends of a segment where nothing blocks it."""
 EDGE_TOLERANCE = 1e-7
 """Distance [m] outside a triangle's edge that still counts as a hit."""
 
@@ -86,8 +86,8 @@ def trace_paths(
         if last >= 0:
             height = plane_distance(scene, last, apex)
             side = 0 if height > 0.0 else 1
-        # plane -1 stands for the path that ends here without another reflection: only the direct one, since a
-        # longer sequence is reached as (parent, plane).
+        # plane -1 is the path that ends here without another reflection: only the direct one, because longer sequences
+        # are reached as (parent, plane).
         for plane in range(-1 if node == 0 else 0, n_planes if max_reflections > 0 else 0):
             n_hits = 0
             if plane >= 0:

@@ -1,17 +1,17 @@
-"""What the forward solver's mirrors reflect, by Snell's law and Fresnel's equations in the refractive index.
+"""Reflectivity of the forward solver's mirrors, by Snell's law and Fresnel's equations in the refractive index.
 
-Shares no code with the ray launcher, which has the formulas of ITU-R P.2040 instead.
+It shares no code with the ray launcher, which uses the formulas of ITU-R P.2040.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 FLOOR_DB = -120.0
-"""A bounce counts as that strong at least, dB, so that gains stay finite."""
+"""Smallest gain of a bounce, dB, to keep gains finite."""
 
 
 def reflection_gain_db(cos_incidence: NDArray[np.float64], permittivity: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Share of the power that half spaces reflect, the mean of both polarisations.
+    """Fraction of the power that half spaces reflect, the mean of both polarisations.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ BEAM_MARGIN = 1e-4
 MAX_WINDOW = 16
 """Largest number of corners of a window; a polygon that reaches it is clipped no further."""
 
-_PARALLEL = 0.999  # least cosine between the normals of coplanar triangles
+_PARALLEL = 0.999  # smallest cosine between the normals of coplanar triangles
 
 
 @njit(cache=True, nogil=True)
@@ -26,7 +26,7 @@ def group_coplanar(
     """Group triangles, given from the largest to the smallest, into planes.
 
     The largest triangle without a group defines the next plane and takes all triangles whose three corners
-    lie within the tolerance of it. Slivers within the tolerance that stand across the plane are not taken.
+    lie within the tolerance of it. Slivers within the tolerance that are not parallel to the plane are not included.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def expand_level(
             size = scene.outline_sizes[plane]
             _copy(scene.outlines[plane], size, polygon)
             if last >= 0:
-                # The hit before has to be on the same side of the new mirror as its image.
+                # The previous hit must be on the same side of the new mirror as its image.
                 in_front = False
                 for i in range(sizes[node]):
                     if plane_distance(scene, plane, windows[node, i]) * distance > -BEAM_MARGIN * abs(distance):
@@ -243,13 +243,13 @@ def _clip_to_beam(
         norm = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
         scale = np.sqrt((ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz))
         if norm < 1e-9 * scale or norm == 0.0:
-            continue  # an edge too short or seen end-on bounds nothing reliably
+            continue  # an edge that is too short, or seen end-on, is not a reliable bound
         inside = 0.0
         for k in range(3):
             normal[k] /= norm
             inside += normal[k] * (centre[k] - apex[k])
         if abs(inside) < BEAM_MARGIN:
-            continue  # a window without width: which side is inside is not sure
+            continue  # a window without width: the inner side is uncertain
         if inside < 0.0:
             for k in range(3):
                 normal[k] = -normal[k]

@@ -12,8 +12,8 @@ point where a path of this sequence can hit::
           /     \         plane b follows only if some of its outline lies in the beam,
      ----=========----    plane b, and the window of (a, b) on it, which is that part
 
-Outlines and beams are supersets, widened by more than the tolerances of the hit tests, so that a sequence is
-dropped only when it cannot carry a path.
+Outlines and beams are supersets, widened by more than the tolerances of the hit tests, a sequence is therefore dropped
+only when it cannot carry a path.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ from rayfix_tables.errors import SceneError
 COPLANAR_DISTANCE = 1e-5
 """Triangles whose vertices lie within this distance [m] of a plane belong to it."""
 
-_BOX_MARGIN = 1e-4  # m; boxes are first tests only and may be generous
+_BOX_MARGIN = 1e-4  # m; boxes are only used for first tests and may be larger than necessary
 _MAX_OUTLINE = 12  # corners; a hull with more is replaced by its bounding rectangle
 _LEAF_SIZE = 4  # triangles in a leaf of the hierarchy
 
@@ -51,7 +51,7 @@ def mirror_scene(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Mir
     SceneError
         If no triangle has an area, or a vertex is not finite.
     """
-    # Contiguous from here on: numba compiles the kernels anew for every other memory layout.
+    # Contiguous from here on: numba would compile the kernels again for other memory layouts.
     corners = np.ascontiguousarray(vertices, dtype=np.float64)[np.ascontiguousarray(faces, dtype=np.int64)]
     if not np.isfinite(corners).all():
         raise SceneError("the mesh has vertices that are not finite; repair the scene file")
@@ -134,7 +134,7 @@ def image_tree(
         planes, sizes = links[:, 1].copy(), links[:, 2].copy()
         if len(planes) == 0:
             break
-        # Rows of a window beyond its size repeat its first corner, so that they do not change the box.
+        # Rows of a window beyond its size repeat its first corner, which leaves the box unchanged.
         low, high = windows.min(axis=1) - _BOX_MARGIN, windows.max(axis=1) + _BOX_MARGIN
         levels.append((images, planes, links[:, 0] + first, low, high))
         first += len(levels[-2][1])
@@ -188,7 +188,7 @@ def _facing(
     normals: NDArray[np.float64],
     offsets: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Whether some of plane c lies on either side of plane b, of shape (n_planes, 2, n_planes)."""
+    """Whether a part of plane c lies on each side of plane b, shape (n_planes, 2, n_planes)."""
     facing = np.zeros((len(normals), 2, len(normals)), dtype=np.bool_)
     for k, (normal, offset) in enumerate(zip(normals, offsets, strict=True)):
         distances = corners @ normal - offset

@@ -24,11 +24,11 @@ class MirrorScene(NamedTuple):
     outline_sizes : ndarray of int of shape (n_planes,)
         Number of corners of each outline.
     facing : ndarray of bool of shape (n_planes, 2, n_planes)
-        ``facing[b, s, c]``: some of plane c lies on side s of plane b (0: against the normal, 1: along it).
+        ``facing[b, s, c]``: a part of plane c lies on side s of plane b (0: against the normal, 1: along it).
     triangle_planes : ndarray of int of shape (n_triangles,)
         Plane of each triangle.
     triangle_faces : ndarray of int of shape (n_triangles,)
-        The triangle's place among the mesh's faces.
+        Index of the triangle among the mesh's faces.
     triangle_normals, triangle_offsets : ndarray of shape (n_triangles, 3) and (n_triangles,), 1 and m
         The triangle's own plane, which may differ from its mirror plane by the merging tolerance.
     edge_normals, edge_offsets : ndarray of shape (n_triangles, 3, 3) and (n_triangles, 3), 1 and m
@@ -37,7 +37,7 @@ class MirrorScene(NamedTuple):
     box_low, box_high : ndarray of shape (n_boxes, 3), m
         Boxes of the bounding volume hierarchy in depth-first order.
     box_skips : ndarray of int of shape (n_boxes,)
-        The box to go on with where a box is missed.
+        Index of the next box if a box is missed.
     box_starts, box_ends : ndarray of int of shape (n_boxes,)
         Range of a leaf in ``box_triangles``; empty in an inner box.
     box_triangles : ndarray of int of shape (n_triangles,)
@@ -67,7 +67,7 @@ class MirrorScene(NamedTuple):
 
 
 class ImageTree(NamedTuple):
-    """Image sources of one station, for all sequences of fewer than ``max_reflections`` planes that matter.
+    """Image sources of one station, for all sequences of fewer than ``max_reflections`` planes that can carry a path.
 
     The last reflection of a path is looked up per point and needs no node.
 

@@ -1,7 +1,7 @@
-"""The workers of a Dask scheduler, asked for their version before they get work.
+"""The workers of a Dask scheduler; each is asked for its version before it gets work.
 
 A worker without rayfix, or with another version, would fail each of its tasks, and a task that only such workers could
-take would wait for ever.
+take would never start.
 """
 
 import logging
@@ -16,10 +16,10 @@ from rayfix_tables.errors import BuildError
 from rayfix_tables.version import software_version
 
 ANSWER_SECONDS = 60.0
-"""Time in which a worker tells its version; it may have to import rayfix first."""
+"""Time in which a worker must return its version; it may have to import rayfix first."""
 
 LEFT_SECONDS = 60.0
-"""Time that a build waits for a worker when none is left; one may be starting anew."""
+"""Time that a build waits for a worker when none is left; one may be restarting."""
 
 _Version = tuple[str, int]
 
@@ -56,7 +56,7 @@ class ClusterWorkers:
         Returns
         -------
         list of str or None
-            None where all workers may take work, so that those to come may, too.
+            None if all workers may take work; workers that join later may take work too.
 
         Raises
         ------
@@ -70,12 +70,12 @@ class ClusterWorkers:
         return None if len(fit) == len(addresses) else fit
 
     def check_left(self) -> None:
-        """Look whether any is left; called from time to time while results are waited for.
+        """Check that a worker is left; called at intervals while waiting for results.
 
         Raises
         ------
         BuildError
-            When there has been none for a while.
+            When there has been none for some time.
         """
         if any(self._known.get(address) for address in self._ask_new()):
             self._none_since = None
@@ -92,7 +92,7 @@ class ClusterWorkers:
         new = [address for address in addresses if address not in self._known]
         own = software_version(), BUILD_VERSION
         for address, answer in self._answers(new).items():
-            if not isinstance(answer, OSError):  # else it has just left, or is busy, and is asked again
+            if not isinstance(answer, OSError):  # otherwise it has just left or is busy, and is asked again
                 self._known[address] = answer == own
             if answer != own:
                 self._reason = _difference(answer, own)
@@ -102,7 +102,7 @@ class ClusterWorkers:
         return addresses
 
     def _answers(self, addresses: list[str]) -> dict[str, Any]:
-        """Return what each worker says: its versions, or the exception that it has instead."""
+        """Return each worker's versions, or the exception that it raised."""
         if not addresses:
             return {}
         with ThreadPoolExecutor(len(addresses)) as pool:
@@ -129,9 +129,9 @@ def _difference(answer: Any, own: _Version) -> str:
     if isinstance(answer, ImportError):
         return f"it has no rayfix ({answer}); install rayfix {own[0]} there"
     if isinstance(answer, TimeoutError):
-        return f"it has not told its version within {ANSWER_SECONDS:.0f} s"
+        return f"it has not returned its version within {ANSWER_SECONDS:.0f} s"
     if isinstance(answer, tuple | list) and len(answer) == 2:
         if answer[0] == own[0]:
             return f"its rayfix builds tables of version {answer[1]}, not {own[1]}; install the same there"
         return f"it has rayfix {answer[0]}, not {own[0]}; install that there"
-    return f"it cannot tell its version ({answer!r}); install rayfix {own[0]} there"
+    return f"it cannot determine its version ({answer!r}); install rayfix {own[0]} there"

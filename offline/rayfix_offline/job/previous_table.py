@@ -165,14 +165,14 @@ class FormerTable:
 def read_former(
     path: Path, method: Method, *, required: bool, refused: Callable[[str], None] = lambda reason: None
 ) -> FormerTable | None:
-    """Open a former table, checked in a process of its own.
+    """Open a former table, checked in a separate process.
 
     Parameters
     ----------
     required : bool
-        Whether a file that is missing or is no table is an error; otherwise there is no former table.
+        Whether a missing or invalid file is an error; otherwise there is no former table.
     refused : callable, optional
-        Told why a file that is there is not taken.
+        Called with the reason when an existing file is not used.
 
     Raises
     ------
@@ -185,5 +185,5 @@ def read_former(
         if required:
             raise
         if path.exists() and path.stat().st_size:
-            refused(f"nothing is taken over from the table that was there: {error}")
+            refused(f"the existing table is not reused: {error}")
         return None

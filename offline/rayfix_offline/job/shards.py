@@ -1,8 +1,8 @@
-"""Finished parts of a build on disk, so that a build that was killed goes on where it was.
+"""Finished blocks of a build on disk, from which a killed build continues.
 
-A shard holds the fitted cells of one block. It is written beside its name, synced and renamed, and begins with the
-SHA-256 of the rest: half a shard or a damaged one is noticed and built again. Shards are named by all that decides
-their content, so that no shard of another site, scene, seed or version is ever taken for the right one.
+A shard holds the fitted cells of one block. It is written under a temporary name, synced and renamed. It begins with
+the SHA-256 of the rest; an incomplete or damaged shard is detected and built again. The name of a shard is a hash of
+everything that determines its content, so shards of another site, scene, seed or version are never used.
 
 Several builds may use one folder at a time, also from containers that share a volume: each holds a lock on it, and only
 the last one removes it.
@@ -29,7 +29,7 @@ from rayfix_tables.errors import BuildError
 
 _DIGEST_BYTES = 32
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-_REMOVAL_SECONDS = 0.01  # between two looks at a folder that another build removes
+_REMOVAL_SECONDS = 0.01  # between two tests for a folder that another build removes
 
 
 def content_key(*parts: Any) -> str:
@@ -52,7 +52,7 @@ class ShardStore:
 
     @classmethod
     def beside(cls, table_path: Path) -> "ShardStore":
-        """Return the store that belongs to a table to be."""
+        """Return the store for a new table."""
         return cls(folder=table_path.with_name(f".{table_path.name}.shards"))
 
     def save(self, name: str, arrays: dict[str, NDArray[Any]]) -> None:
@@ -61,7 +61,7 @@ class ShardStore:
         Raises
         ------
         BuildError
-            When the disk is full or the folder cannot be written; all earlier shards stay.
+            When the disk is full or the folder cannot be written; earlier shards are kept.
         """
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, **arrays)
@@ -80,12 +80,12 @@ class ShardStore:
             with contextlib.suppress(OSError):
                 partial.unlink()
             raise BuildError(
-                f"cannot save {path}: {error.strerror}; nothing finished is lost: free some space and run the same "
-                "build again, it goes on from here"
+                f"cannot save {path}: {error.strerror}; finished blocks are kept: free some space and run the same "
+                "build again to continue"
             ) from error
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """Load a shard; None when it is not there, or damaged (it is then removed)."""
+        """Load a shard; None when it is missing or damaged. A damaged shard is removed."""
         path = self.folder / name
         try:
             stored = path.read_bytes()
@@ -102,7 +102,7 @@ class ShardStore:
         return None
 
     def remove(self) -> None:
-        """Remove the folder with all shards and what a killed build left half written, unless another build uses it."""
+        """Remove the folder with all shards, complete or not, unless another build uses it."""
         try:
             descriptor = self._held.pop() if self._held else os.open(self.folder, _FOLDER)
         except OSError:  # there is none
@@ -114,17 +114,17 @@ class ShardStore:
             os.close(descriptor)
 
     def close(self) -> None:
-        """Leave the folder to other builds; it stays."""
+        """Release the folder, which is not removed."""
         while self._held:
             os.close(self._held.pop())
 
     def _take_folder(self) -> None:
-        """Make the folder, and tell other builds that it is in use until it is closed or this process ends."""
+        """Create the folder and lock it against removal by other builds until it is closed or this process ends."""
         while not self._held:
             self.folder.mkdir(exist_ok=True)
             try:
                 descriptor = os.open(self.folder, _FOLDER)
-            except FileNotFoundError:  # removed just now by a build that was done with it
+            except FileNotFoundError:  # another build has just finished and removed it
                 continue
             if try_lock(descriptor, shared=True) is not False and is_at(descriptor, self.folder):
                 self._held.append(descriptor)

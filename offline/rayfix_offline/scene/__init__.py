@@ -1,1 +1,1 @@
-"""Scene files in, triangles with materials out; and the engine that finds what a ray hits."""
+"""Reads scene files into triangles with materials, and finds the triangles that rays hit."""

@@ -1,4 +1,4 @@
-"""Which triangle a ray hits first: a small interface, and Embree behind it."""
+"""The first triangle that a ray hits: a small interface, implemented with Embree."""
 
 from typing import Protocol
 
@@ -41,9 +41,9 @@ class RayEngine(Protocol):
 
 
 class EmbreeEngine:
-    """Intel Embree. It works in float32; whoever needs the hit point computes it from the triangle's plane.
+    """Intel Embree. It works in float32; callers compute hit points from the triangle's plane.
 
-    Scenes on map coordinates are moved next to the origin; all others stay where they are.
+    Scenes on map coordinates are translated to the origin; all others are not.
     """
 
     def __init__(self, triangles: NDArray[np.float64]) -> None:

@@ -171,7 +171,7 @@ def complex_permittivity(name: str, carrier_ghz: float) -> complex | None:
     Parameters
     ----------
     name : str
-        As a mesh has it; see :func:`itu_name`.
+        Name in a mesh; see :func:`itu_name`.
     carrier_ghz : float
 
     Returns

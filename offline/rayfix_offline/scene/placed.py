@@ -1,4 +1,4 @@
-"""What a reader makes of a scene file: objects with their places, and what it passed over."""
+"""The result of a scene file's reader: objects with their transforms, and remarks."""
 
 from dataclasses import dataclass, field
 
@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_TRIANGLES = 20_000_000
-"""Triangles of a scene, each instance of a mesh counted; they take some 10 GB of memory."""
+"""Largest number of triangles of a scene, with every instance of a mesh; they take about 10 GB of memory."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Placed:
-    """An object of a scene with its place in it.
+    """An object of a scene and its transform.
 
     Attributes
     ----------
@@ -36,14 +36,14 @@ class Placed:
 
 @dataclass(frozen=True, kw_only=True)
 class Remark:
-    """Something in a scene file that its reader could not take as it stands.
+    """Something in a scene file that its reader left out or changed.
 
     Attributes
     ----------
     kind : str
-        What it is about, in one or two words.
+        Topic in one or two words.
     problem : str
-        What it is, and what became of it.
+        The problem, and how it was handled.
     remedy : str
     """
 
@@ -54,16 +54,16 @@ class Remark:
 
 @dataclass(frozen=True, kw_only=True)
 class Contents:
-    """What a scene file holds.
+    """The content of a scene file.
 
     Attributes
     ----------
     objects : tuple of Placed
     remarks : tuple of Remark
     metres : float, optional
-        Length of the file's unit, m, where the file says it.
+        Length of the file's unit, m, if the file states it.
     up : {"x", "y", "z"}, optional
-        Upward axis, where the file says it.
+        Upward axis, if the file states it.
     """
 
     objects: tuple[Placed, ...]
@@ -78,11 +78,11 @@ def one_material(name: str | None, num_faces: int) -> tuple[tuple[str, ...], NDA
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number with its noun, in the plural unless it is one."""
+    """Return a number and its noun, in the plural unless it is one."""
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 
 def too_few_corners(number: int) -> Remark:
-    """Return what to say of faces with one or two corners."""
+    """Return the remark on faces with one or two corners."""
     problem = f"{counted(number, 'face')} of fewer than three corners left out"
     return Remark(kind="left out", problem=problem, remedy="clean the mesh")

@@ -1,8 +1,8 @@
 """Polygons cut into triangles that cover them and keep all of their corners.
 
-A fan from the first corner covers what is convex, but walls up a doorway. Ears (mapbox's earcut) cover what has bays
-and holes. They leave out corners between edges in one line, which a neighbouring polygon may have: triangles are cut
-there, so that the surface stays closed.
+A fan from the first corner covers convex polygons, but would close the doorway of a wall. Ear clipping (mapbox's
+earcut) covers concave polygons and holes. It leaves out corners between collinear edges, which a neighbouring polygon
+may have: triangles are cut there to keep the surface closed.
 """
 
 from collections import Counter
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rayfix_offline.scene.placed import Remark, counted
 
 FLAT = 0.01
-"""A polygon whose corners are farther than this fraction of its size from its plane is told of."""
+"""A warning is given for polygons with corners farther than this fraction of their size from their plane."""
 
 _IN_LINE = 1e-7
 """A corner nearer than this fraction of the polygon's size to an edge lies on it."""
@@ -31,11 +31,11 @@ class Triangles:
     Attributes
     ----------
     faces : ndarray of int64, shape (n_faces, 3)
-        Vertices, as the polygons name them.
+        Indices of vertices, as in the polygons.
     polygons : ndarray of int64, shape (n_faces,)
-        Which polygon each is of; ascending.
+        Polygon of each triangle; ascending.
     crossing : ndarray of int64
-        Polygons that cross themselves or have no area, so that no triangles cover them: they are cut as a fan.
+        Polygons that cross themselves or have no area. No triangulation covers them: they are cut as a fan.
     bent : ndarray of int64
         Polygons whose corners do not lie in a plane.
     """
@@ -48,7 +48,7 @@ class Triangles:
     def remarks(
         self, vertices: NDArray[np.float64], corners: NDArray[np.int64], starts: NDArray[np.int64]
     ) -> tuple[Remark, ...]:
-        """Return what there is to say about the polygons that these triangles are of; see :func:`cut_polygons`."""
+        """Return remarks on the polygons of these triangles; see :func:`cut_polygons`."""
         found = []
         for which, what in (
             (self.crossing, "that cross themselves or have no area are cut as a fan, perhaps wrongly"),
@@ -74,7 +74,7 @@ def cut_polygons(
     *,
     holes: Mapping[int, Sequence[NDArray[np.int64]]] | None = None,
 ) -> Triangles:
-    """Cut polygons into triangles that face as they do.
+    """Cut polygons into triangles of the same orientation.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def _planes(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
         area = np.linalg.norm(normals, axis=1)
         height = np.abs(np.einsum("nki,ni->nk", off, normals)).max(axis=1)
         size = np.abs(off).max(axis=(1, 2))
-        # A polygon without an area has no plane, and is told of otherwise.
+        # A polygon without an area has no plane; there is another warning for it.
         return normals, ~(height > FLAT * size * area)
 
 
@@ -158,7 +158,8 @@ def _fans(
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Which polygons a fan covers, and their fans, shape (n_covered, size - 2, 3).
 
-    All of a fan's triangles face as the polygon does, and it does not turn full circle. A quadrilateral has two fans.
+    A covering fan's triangles all have the orientation of the polygon, and it does not turn a full circle. A
+    quadrilateral has two fans.
     """
     size = rings.shape[1]
     fanned = _is_fan(points, normals)
@@ -192,7 +193,7 @@ def _fan(ring: NDArray[np.int64]) -> NDArray[np.int64]:
 def _ears(
     vertices: NDArray[np.float64], rings: Sequence[NDArray[np.int64]], normal: NDArray[np.float64]
 ) -> NDArray[np.int64] | None:
-    """Cut one polygon, whose first ring is its outline; None where no triangles cover it."""
+    """Cut one polygon; the first ring is its outline. None if no triangulation covers it."""
     rings = [_without_repeats(vertices, ring) for ring in rings]
     rings = [ring for number, ring in enumerate(rings) if number == 0 or len(ring) >= 3]
     if len(rings[0]) < 3:
@@ -209,7 +210,7 @@ def _ears(
     ends = np.cumsum([len(ring) for ring in rings])
     cut = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends.astype(np.uint32))
     triangles = [(int(a), int(b), int(c)) for a, b, c in np.asarray(cut).reshape(-1, 3)]
-    # Corners in one line make triangles of no area; without them, cuts at those corners fill the place.
+    # Collinear corners make triangles without an area. They are left out; cuts at those corners replace them.
     triangles = [t for t in triangles if abs(_doubled(flat, t)) > _IN_LINE * _longest(flat, t)]
     triangles = [t if _doubled(flat, t) > 0.0 else (t[0], t[2], t[1]) for t in triangles]
     triangles = _cut_at_corners(flat, triangles)
@@ -219,7 +220,7 @@ def _ears(
 
 
 def _without_repeats(vertices: NDArray[np.float64], ring: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Leave out corners at the place of the one before."""
+    """Leave out corners with the same position as the one before."""
     points = vertices[ring]
     kept = ring[(points != np.roll(points, 1, axis=0)).any(axis=1)]
     return np.asarray(kept)
@@ -261,7 +262,7 @@ def _cut_at_corners(flat: NDArray[np.float64], triangles: list[tuple[int, int, i
 
 
 def _covers(flat: NDArray[np.float64], ends: NDArray[np.int64], triangles: list[tuple[int, int, int]]) -> bool:
-    """Whether the triangles' border is the polygon's, and their area too."""
+    """Whether border and area of the triangles are those of the polygon."""
     sides = Counter((t[k], t[(k + 1) % 3]) for t in triangles for k in range(3))
     border = Counter({side: n - sides[side[::-1]] for side, n in sides.items() if n > sides[side[::-1]]})
     expected: Counter[tuple[int, int]] = Counter()

@@ -42,10 +42,10 @@ UPRIGHT = {
 """Rotation that turns a file's upward axis to z."""
 
 SINGLE_PRECISION = ("glb", "gltf", "ply", "stl")
-"""Files that hold, or may hold, coordinates in single precision."""
+"""File types with coordinates in single precision, always or sometimes."""
 
 COARSE = 0.005
-"""Steps of coordinates [m] above which walls of a scene lie notably off."""
+"""Step of coordinates [m] above which walls are notably displaced."""
 
 _MIN_AREA = 1e-12
 
@@ -69,9 +69,9 @@ class Scene:
     num_degenerate : int
         Triangles without an area, left out.
     says_up : bool
-        The file itself said which axis points up.
+        Whether the file itself states the upward axis.
     remarks : tuple of Remark
-        What the file's reader left out, or could not take as it stands.
+        What the file's reader left out or changed.
     """
 
     vertices: NDArray[np.float64]
@@ -96,7 +96,7 @@ class Scene:
         return np.stack([used.min(axis=0), used.max(axis=0)])
 
     def moved(self, by: NDArray[np.float64]) -> "Scene":
-        """Return the same scene elsewhere, moved by a vector of shape (3,), m."""
+        """Return the scene translated by a vector of shape (3,), m."""
         return replace(self, vertices=self.vertices + by) if np.any(by) else self
 
     @property
@@ -115,9 +115,9 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
     Parameters
     ----------
     unit : {"m", "cm", "mm", "in", "ft"}
-        Unit of the coordinates, unless the file itself says it (COLLADA and IFC do).
+        Unit of the coordinates, unless the file itself states it (COLLADA and IFC do).
     up : {"z", "y"}
-        Which axis of the file points up, unless the file itself says it (COLLADA and IFC do).
+        Axis of the file that points up, unless the file itself states it (COLLADA and IFC do).
 
     Raises
     ------
@@ -136,15 +136,15 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
         raise SceneError(f"{path} cannot be read ({error.strerror}); correct its permissions") from error
     objects = [each for each in contents.objects if len(each.faces)]
     if not objects:
-        told = "".join(f" ({remark.problem})" for remark in contents.remarks[:1])
-        raise SceneError(f"{path} holds no triangles{told}; export the scene as a triangle mesh")
+        first = "".join(f" ({remark.problem})" for remark in contents.remarks[:1])
+        raise SceneError(f"{path} holds no triangles{first}; export the scene as a triangle mesh")
     scale = METRES_PER_UNIT[unit] if contents.metres is None else contents.metres
     if not all(np.isfinite(each.vertices).all() and np.isfinite(each.transform).all() for each in objects):
         raise SceneError(f"{path} has coordinates that are not finite; export the scene again")
     num_triangles = sum(len(each.faces) for each in objects)
     if num_triangles > MOST_TRIANGLES:
         raise SceneError(
-            f"{path} has {num_triangles:,} triangles, more than {MOST_TRIANGLES:,}; leave out what is small"
+            f"{path} has {num_triangles:,} triangles, more than {MOST_TRIANGLES:,}; leave out small objects"
         )
     _refuse_far(path, objects, scale)
     if kind in SINGLE_PRECISION:
@@ -156,7 +156,7 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
 
 
 def _refuse_far(path: Path, objects: list[Placed], scale: float) -> None:
-    """Refuse coordinates that are no building's: squares and voxels of them overflow."""
+    """Refuse coordinates that are too large for a building: their squares and numbers of voxels overflow."""
     for each in objects:
         with np.errstate(all="ignore"):
             reach = np.abs(_points(each) * scale).max(initial=0.0)
@@ -168,7 +168,7 @@ def _refuse_far(path: Path, objects: list[Placed], scale: float) -> None:
 
 
 def _coarse_coordinates(objects: list[Placed], scale: float) -> Iterator[Remark]:
-    """Tell of map coordinates in single precision; those of nodes, which are in double, move objects without a loss."""
+    """Warn of map coordinates in single precision. Transforms of nodes are in double precision and lose nothing."""
     steps = [float(np.spacing(np.float32(np.abs(each.vertices).max(initial=0.0)))) * scale for each in objects]
     coarse = [
         (each.name, step)
@@ -180,7 +180,7 @@ def _coarse_coordinates(objects: list[Placed], scale: float) -> Iterator[Remark]
         yield Remark(
             kind="precision",
             problem=f"the file holds the coordinates of {counted(len(coarse), 'object')} in single precision, so far "
-            f"from the origin that they have steps of up to {step:.3g} m ('{name}'): walls lie up to half of that off",
+            f"from the origin that they have steps of up to {step:.3g} m ('{name}'): walls can be off by half of that",
             remedy="move the objects next to the origin before the export, and the stations with them",
         )
 
@@ -197,7 +197,7 @@ def _gather(path: Path, objects: list[Placed], contents: Contents, *, scale: flo
     count = 0
     for index, each in enumerate(objects):
         vertices.append(_points(each) @ turn.T * scale)
-        # A mirrored object keeps its outside.
+        # A mirrored object keeps its orientation.
         faces.append((each.faces if np.linalg.det(each.transform[:3, :3]) >= 0.0 else each.faces[:, ::-1]) + count)
         count += len(each.vertices)
         used = np.unique(each.face_materials[each.face_materials >= 0])

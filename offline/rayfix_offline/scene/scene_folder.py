@@ -1,4 +1,4 @@
-"""Files that a scene names: only those in its folder are read."""
+"""Files that a scene refers to; only files in its folder are read."""
 
 from pathlib import Path, PureWindowsPath
 from urllib.parse import unquote
@@ -7,26 +7,26 @@ from rayfix_tables.errors import SceneError
 
 
 def inside(folder: Path, base: Path, name: str) -> Path | None:
-    """Return the path of a file that a scene names, None where that leaves the scene's folder.
+    """Return the path of a file that a scene refers to, None if it is outside of the scene's folder.
 
     Parameters
     ----------
     folder : Path
         The scene's.
     base : Path
-        That of the file which names it, in ``folder``.
+        Folder of the file that refers to it, within ``folder``.
     name : str
-        Relative to ``base``. Links count as where they lead.
+        Relative to ``base``. Links are resolved.
     """
     try:
         path = (base / name).resolve()
-    except (OSError, RuntimeError, ValueError):  # a name that is too long, a circle of links, a zero byte
+    except (OSError, RuntimeError, ValueError):  # a name that is too long, a cycle of links, a zero byte
         return base / "no such file"
     return path if path.is_relative_to(folder.resolve()) else None
 
 
 def is_file(path: Path) -> bool:
-    """Whether a path is a file; one that no file can have is none."""
+    """Whether a path is a file; False for an invalid path."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -34,7 +34,7 @@ def is_file(path: Path) -> bool:
 
 
 def outside_error(where: str, name: str) -> SceneError:
-    """Return what to raise when a scene names a file elsewhere."""
+    """Return the error for a file outside of the scene's folder."""
     return SceneError(
         f"{where} names the file '{name[:200]}', which is not in the scene's folder; put it there and name it relative "
         "to the file that needs it"
@@ -42,7 +42,7 @@ def outside_error(where: str, name: str) -> SceneError:
 
 
 class SceneFolder:
-    """Finds the files of a scene's folder, and remembers which it was asked for elsewhere."""
+    """Finds the files of a scene's folder, and records references to files elsewhere."""
 
     def __init__(self, folder: Path, base: Path) -> None:
         self.folder = folder
@@ -50,10 +50,10 @@ class SceneFolder:
         self.refused: list[str] = []
 
     def find(self, name: str) -> Path | None:
-        """Return the path of a file that the scene names, None where it is not there.
+        """Return the path of a file that the scene refers to, None if it is missing.
 
-        A URI may have what is no letter as %20; a file may be called so. Exporters write where a file was on their
-        machine, perhaps with another system's separators; it may have come along.
+        A URI may be percent-encoded, and a file name may contain such codes. Exporters write paths of their machine,
+        perhaps with another system's separators; the file may be in the scene's folder.
         """
         name = name.strip()
         candidates = dict.fromkeys((name, unquote(name)))
@@ -72,7 +72,7 @@ class SceneFolder:
         return None
 
     def refuse_outside(self, where: str) -> None:
-        """Raise when a file elsewhere was asked for.
+        """Raise if the scene refers to a file elsewhere.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Text of scene files, whose encoding no format declares."""
+"""Decoding of scene files; the formats do not declare an encoding."""
 
 import codecs
 
@@ -12,15 +12,15 @@ _MARKS = (
 
 
 def decode(content: bytes) -> str:
-    """Return a file's text: in what its byte order mark says, in UTF-8, or in the Western code page of Windows.
+    """Decode a file: by its byte order mark, as UTF-8, or in the Western code page of Windows.
 
-    Numbers and keywords are the same in all code pages. A name in another one is spelt wrongly, but the same wherever
-    the files name it. Bytes that the code page lacks are taken as in Latin-1.
+    Numbers and keywords are the same in all code pages. A name in another one is misspelt, but the same in all places.
+    Bytes that the code page lacks are decoded as Latin-1.
 
     Raises
     ------
     UnicodeDecodeError
-        When the text does not hold to its byte order mark.
+        When the text does not match its byte order mark.
     """
     for mark, encoding in _MARKS:
         if content.startswith(mark):

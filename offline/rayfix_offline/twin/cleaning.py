@@ -32,8 +32,8 @@ class Duplicates:
 def find_duplicates(mesh: Mesh) -> Duplicates:
     """Find duplicate triangles; :meth:`Mesh.without` removes the redundant ones.
 
-    A pair of triangles back to back within an object remains where other triangles of the part have no back face: that
-    is how touching boxes are drawn.
+    A pair of triangles back to back within an object remains where other triangles of the part have no back face:
+    touching boxes are drawn like this.
     """
     scene, topology = mesh.scene, mesh.topology
     count = len(scene.faces)

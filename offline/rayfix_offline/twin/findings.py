@@ -19,7 +19,7 @@ LARGE_SCENE, SMALL_SCENE = 1000.0, 1.0
 """A scene larger or smaller than this probably has another unit, m."""
 
 OPAQUE_ABOVE = 10.0
-"""Carrier frequency from which on thin partitions take much of a signal, GHz."""
+"""Carrier frequency above which thin partitions attenuate signals strongly, GHz."""
 
 MOST_NAMES = 4
 
@@ -83,7 +83,7 @@ def size_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
 
 
 def file_findings(scene: Scene) -> Iterator[Finding]:
-    """Tell what the scene file's reader left out, or could not take as it stands."""
+    """Report what the scene file's reader left out or changed."""
     for remark in scene.remarks:
         yield warning(remark.kind, remark.problem, remark.remedy)
 
@@ -133,7 +133,7 @@ def mesh_findings(
 
 
 def material_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
-    """Find where the constant loss stands in for a material."""
+    """Find where the constant loss replaces that of a material."""
     if site.propagation.reflection != "itu":
         return
     bare = np.count_nonzero(scene.face_materials < 0)
@@ -168,7 +168,7 @@ def material_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
 
 
 def partition_findings(site: SiteFile, scene: Scene, partitions: Partitions) -> Iterator[Finding]:
-    """Tell of thin walls, which are opaque here and not to signals of low frequencies."""
+    """Warn of thin walls: they block all rays, but not signals of low frequencies."""
     if site.propagation.carrier_ghz >= OPAQUE_ABOVE or not partitions.faces.any():
         return
     walls = [scene.objects[n] for n in np.unique(scene.face_objects[partitions.faces])]
@@ -192,7 +192,7 @@ def station_findings(
 ) -> Iterator[Finding]:
     """Find stations at impossible positions; one nearer than ``touch`` [m] to a surface lies on it.
 
-    Site and scene are in a frame whose origin, shape (3,), m, the findings add again.
+    Site and scene are relative to an origin of shape (3,), m, which the findings add to positions.
     """
     given = site.moved(origin)
     outside = _what_would_hold_stations(given, scene, origin) or "correct position_m or scene_unit"

@@ -1,8 +1,8 @@
-"""Thin partitions: walls that a signal passes, while rays do not.
+"""Thin partitions: walls that signals penetrate, but rays do not.
 
-Samples of the upright triangles are thin where the free space goes on at both of their sides. Those that stand from
-floor to ceiling are walls in a map of the floor. They are partitions if the map falls into more rooms with them than
-without them, gaps as wide as doors closed.
+Samples of upright triangles are thin where there is free space on both sides. Those from floor to ceiling are walls in
+a map of the floor. They are partitions if the map has more rooms with them than without them, after closing gaps as
+wide as doors.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from rayfix_offline.scene.scene import Scene
 from rayfix_tables.freespace import FreeSpace
 
 HEAVY = frozenset({"metal", "concrete", "brick", "marble"})
-"""Materials of ITU-R P.2040 of which also thin walls let little through."""
+"""Materials of ITU-R P.2040 of which even thin walls attenuate strongly."""
 
 THICKNESS = 0.2
 """Walls up to this thickness are thin, m."""
@@ -28,19 +28,19 @@ CELL = 0.2
 """Side of the cells of the map, m."""
 
 FULL_HEIGHT = 0.7
-"""Least fraction of the free height that a wall takes up."""
+"""Smallest fraction of the free height that a wall takes up."""
 
 HALF_DOOR = 0.6
 """Gaps up to twice this width are doors, m."""
 
 ROOM_AREA = 2.0
-"""Least area of a room, m2, without the half width of a door along its walls."""
+"""Smallest area of a room, m2, without a margin of half a door's width along its walls."""
 
 LEAST_LENGTH = 2.0
-"""Least length of partitions for each room that they make, m."""
+"""Smallest length of partitions per room that they make, m."""
 
 MOST_SAMPLES = 2_000_000
-"""Samples of a scene's triangles; those of larger scenes are farther apart."""
+"""Largest number of samples of a scene's triangles; samples of larger scenes are farther apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ def find_partitions(scene: Scene, free_space: FreeSpace, *, closed: bool) -> Par
     around = ndimage.maximum_filter(height, size=2 * int(np.ceil(0.5 / cell)) + 1)
     standing = (walls >= FULL_HEIGHT * around) & (around > 0.0)
     open_floor = (height >= FULL_HEIGHT * around) & (height > 0.0)
-    # Slabs are not free themselves; without them there would be floor.
+    # Voxels of slabs are not free; without the slabs they would be floor.
     without = _count_rooms(open_floor | ndimage.binary_dilation(standing), cell, closed=closed)
     rooms = _count_rooms(open_floor & ~standing, cell, closed=closed)
     length = cell * float(np.count_nonzero(standing))

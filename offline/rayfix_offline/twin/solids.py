@@ -48,7 +48,7 @@ class Part:
     middle: tuple[float, float, float]
 
     def moved(self, by: NDArray[np.float64]) -> "Part":
-        """Return the same part elsewhere, moved by a vector of shape (3,), m."""
+        """Return the part translated by a vector of shape (3,), m."""
         x, y, z = (np.asarray(self.middle) + by).tolist()
         return replace(self, middle=(x, y, z))
 
@@ -192,7 +192,7 @@ def map_free_space(
     low, high = scene.bounds
     extent = np.maximum(high - low, voxel_size)
     voxel_size = max(voxel_size, float((np.prod(extent) / max_voxels) ** (1.0 / 3.0)))
-    # Across a flat scene a voxel may be larger than the scene, and is one nevertheless.
+    # A flat scene may be thinner than a voxel, and still has one.
     while float(np.prod(np.ceil(extent / voxel_size))) > 2.0 * max_voxels:
         voxel_size *= 1.1
     shape = tuple(int(n) for n in np.ceil(extent / voxel_size - 1e-9))
@@ -240,7 +240,7 @@ def _flip_above(
 ) -> None:
     """Flip the voxels whose centres lie above each triangle, so that those inside the part end up set."""
     nx, ny, nz = parity.shape
-    # Columns slightly beside the voxels' centres, so that they hit no edge of a drawing on round coordinates.
+    # Columns are offset slightly from the voxels' centres, because edges of drawings often have round coordinates.
     shift_x, shift_y = 0.5 + 1.37e-5, 0.5 + 2.71e-5
     for t in range(len(triangles)):
         ax, ay, az = triangles[t, 0]

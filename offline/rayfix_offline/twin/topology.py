@@ -63,10 +63,10 @@ class Topology:
         return np.asarray(label[at[:, 0]])
 
     def turned(self, groups: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """Say which triangles to turn so that neighbours face the same way.
+        """Find the triangles to flip for a consistent orientation of neighbours.
 
-        Only neighbours count that share an edge which no third triangle of their group has. Of what hangs together so,
-        the smaller number is turned. What cannot be turned to agree, as a Moebius strip, stays.
+        Neighbours are two triangles that share an edge with no third triangle of their group. In each connected set,
+        the smaller number is flipped. Sets without a consistent orientation, such as a Moebius strip, are unchanged.
 
         Parameters
         ----------
@@ -83,8 +83,8 @@ class Topology:
         order = order[uses[inverse.reshape(-1)[order]] == 2]
         first, second = order[0::2], order[1::2]
         forward = (self.points < np.roll(self.points, -1, axis=1)).reshape(-1)
-        # Each triangle is there twice, as drawn and turned; neighbours that run through their edge in the same
-        # direction agree where one of them is turned.
+        # Each triangle occurs twice, as drawn and flipped. Neighbours that traverse their edge in the same direction
+        # agree if one of them is flipped.
         other = np.where(forward[first] == forward[second], count, 0)
         one, two = first // 3, second // 3
         links = np.concatenate(

@@ -39,11 +39,11 @@ class Twin:
     Attributes
     ----------
     site : SiteFile
-        Its stations in the frame of the scene below.
+        The site, with stations in the frame of ``scene``.
     scene : Scene
-        In the frame of the table, which begins at the origin below.
+        The scene in the table's frame, which is relative to ``origin``.
     origin : ndarray of shape (3,), m
-        In the frame of the scene file; zero but for scenes on map coordinates.
+        Origin of the table's frame in the frame of the scene file; zero except for scenes on map coordinates.
     """
 
     site: SiteFile
@@ -122,9 +122,9 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
 
 
 def table_origin(scene: Scene) -> NDArray[np.float64]:
-    """Origin of the table's frame, shape (3,), m: zero, or the middle of a scene that lies far off, in whole metres.
+    """Origin of the table's frame, shape (3,), m: zero, or for a scene far from it the scene's middle in whole metres.
 
-    It is zero also along axes on which the middle lies nearer to zero than the scene is large. Along the others the
+    It is also zero along axes where the middle is nearer to zero than the scene's size. Along the others the
     scene's coordinates are within a factor of 2 of it, so that subtracting and adding it is exact.
     """
     low, high = scene.bounds

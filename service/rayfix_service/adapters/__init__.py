@@ -1,1 +1,1 @@
-"""Formats of other systems: their measurements in, their positions out. docs/formats.md describes them."""
+"""Formats of other systems: reads their measurements and writes their positions. docs/formats.md describes them."""

@@ -1,4 +1,4 @@
-"""A foreign message as a report of this project, with the way back to its fields."""
+"""A report made from another system's message, and the field of the message that each measurement comes from."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ class Skipped:
     Attributes
     ----------
     path : tuple of (str or int)
-        Where it stands in the message.
+        Its path in the message.
     reason : str
         Why it is left out.
     """
@@ -44,7 +44,7 @@ class Adapted:
     ----------
     report : Report
     sources : tuple of tuple of (str or int)
-        Where in the message each measurement of ``report`` comes from, in its order.
+        Path in the message of each measurement of ``report``, in the same order.
     skipped : tuple of Skipped
         Measurements of the message that are not in ``report``.
     """
@@ -64,9 +64,9 @@ def adapted_report(
     confidence: float = CONFIDENCE,
     limits: MessageLimits = USUAL_LIMITS,
 ) -> Adapted:
-    """Combine measurements and what was left out.
+    """Make a report of converted measurements, and list those that were left out.
 
-    Quantised as other systems' are, an angle or an arrival may well come twice; it is then counted once.
+    Measurements of other systems are quantised, and two can be equal. Of equal angles or times of arrival, one is used.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def adapted_report(
 
 
 def station_of(name: str, *maps: Mapping[str, str] | None) -> str:
-    """Return the station that another system calls `name`: by the first map that has it, else the name itself."""
+    """Return the station of another system's `name`: that of the first map with this name, else the name itself."""
     return next((stations[name] for stations in maps if stations and name in stations), name)
 
 
@@ -118,7 +118,7 @@ def with_height(adapted: Adapted, height: Height | None) -> Adapted:
 
 
 def with_confidence(adapted: Adapted, confidence: float | None) -> Adapted:
-    """Ask for another probability with which accuracies are to hold; None leaves it to the report.
+    """Replace the report's probability that the stated accuracies hold; None keeps it.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def with_confidence(adapted: Adapted, confidence: float | None) -> Adapted:
 
 
 def error_in_message(error: ReportError, adapted: Adapted) -> InvalidReportError:
-    """Name in an error of the report the field of the message that it comes from."""
+    """Convert an error of the report: it then names the field of the original message."""
     source: Path = ()
     if len(error.path) > 1 and error.path[0] == "measurements" and isinstance(error.path[1], int):
         source = adapted.sources[error.path[1]]
@@ -149,21 +149,21 @@ def station_map(pairs: Iterable[str]) -> dict[str, str]:
     Raises
     ------
     ReportError
-        For a pair that is none.
+        When a pair has another form.
     """
     stations = {}
     for pair in pairs:
         name, equals, station = pair.rpartition("=")
         if not (name and equals and station):
             raise ReportError(
-                f"station {pair!r} is no pair; give NAME=STATION, e.g. CD84C98B935D=bs1", path=("station",)
+                f"station {pair!r} is not a pair; give NAME=STATION, e.g. CD84C98B935D=bs1", path=("station",)
             )
         stations[name] = station
     return stations
 
 
 def check_stations(stations: Mapping[str, str], known: Collection[str]) -> None:
-    """Refuse a map to stations that a table does not have: else only the first message would show the mistake.
+    """Check that all mapped stations are in the table; otherwise the mistake would only show with the first message.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def check_stations(stations: Mapping[str, str], known: Collection[str]) -> None:
     for name, station in stations.items():
         if station not in known:
             raise ReportError(
-                f"{name} is to be station '{station}', which is not in the table; it has {', '.join(known)}",
+                f"{name} is mapped to station '{station}', which is not in the table; it has {', '.join(known)}",
                 path=("station",),
             )
 

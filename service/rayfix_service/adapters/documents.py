@@ -32,7 +32,7 @@ Stations = Annotated[
     dict[str, Annotated[str, Field(min_length=1, max_length=128)]] | None,
     Field(description='an object of station identifiers of the table by the names in the message, e.g. {"1": "bs1"}'),
 ]
-"""Which station of the table a name of the message means; a name that is not in it is a station's identifier."""
+"""Stations of the table by the names in the message; a name that is not in the map is itself a station's identifier."""
 
 TargetId = Annotated[
     str | None, Field(max_length=256, description="your name for the target, a text of at most 256 characters")
@@ -67,23 +67,23 @@ def check(
     Parameters
     ----------
     model : type of WireModel
-        What the message must be like.
+        The model that the message must match.
     message : Mapping or bytes
         The parsed message, or its JSON text.
     what : str
-        What the message is called in errors about the whole of it.
+        Name of the message in errors that concern all of it.
     limits : MessageLimits, optional
     check_counts : callable, optional
-        Raises InvalidReportError when a message, which need not be valid, has too much of something.
+        Raises InvalidReportError when a message has too many elements. The message may be invalid.
     unwrap : callable, optional
-        Takes the message out of what it is sent in.
+        Extracts the message from its envelope.
 
     Raises
     ------
     MalformedJsonError
         For bytes that are not JSON.
     InvalidReportError
-        For a message that does not fit.
+        For a message that does not match the model.
     """
     most = limits.message_values
     if isinstance(message, bytes) and len(message) > min(_SHORT, most) and has_more_values(message, most):
@@ -113,7 +113,7 @@ def one_of(model: WireModel) -> tuple[str, Any]:
     Raises
     ------
     PydanticCustomError
-        When the model holds none or several.
+        When the model has no alternative, or several.
     """
     fields = type(model).model_fields
     given = [

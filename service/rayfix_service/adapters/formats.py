@@ -1,4 +1,4 @@
-"""The formats by their names, as the command line and the HTTP interface know them."""
+"""Conversion from and to formats by name, for the command line and the HTTP interface."""
 
 from collections.abc import Mapping
 from datetime import datetime
@@ -31,7 +31,7 @@ def parse(
     errors: AngleErrors = USUAL_ERRORS,
     received: datetime | None = None,
 ) -> tuple[Adapted, ...]:
-    """Turn a message into reports: one, or for u-blox lines one for each transmission.
+    """Convert a message into reports: a single one, or one for each transmission of u-blox lines.
 
     Parameters
     ----------
@@ -39,20 +39,20 @@ def parse(
         The message.
     input_format : {"native", "nrppa", "silabs", "ublox"}
     stations : Mapping, optional
-        Stations by the names that the message has for them; the native format has the stations' own.
+        Stations by their names in the message; the native format uses the stations' identifiers.
     height : Height, optional
         Known height of the target, for messages without one.
     confidence : float, optional
-        Probability with which accuracies are to hold, instead of that of the message.
+        Probability that the stated accuracies hold, instead of that of the message.
     errors : AngleErrors, optional
-        Of the angles of u-blox lines, which state none.
+        Errors of the angles of u-blox lines, which do not state them.
     received : datetime, optional
-        When the message was received: u-blox lines without a time get theirs from it.
+        When the message was received; u-blox lines without a time are dated from it.
 
     Raises
     ------
     MalformedJsonError
-        For bytes that are not JSON in a format that is.
+        For bytes that are not JSON, when the format is JSON.
     InvalidReportError
         For a message that is not valid.
     ReportError
@@ -95,14 +95,14 @@ def write(
     fix : Fix
     output_format : {"native", "3gpp", "omlox"}
     site : SiteInfo
-        Where the fix is.
+        Site of the fix.
     compute_seconds : float
-        Time that the fix took, s.
+        Computing time of the fix, s.
     adapted : Adapted, optional
-        Where the report came from, if from another format; the native answer then has the ``source`` of each
+        The converted report, if it came in another format. The native answer then has the ``source`` of each
         measurement and the measurements that were ``skipped``.
     track : TrackedPosition, optional
-        The target's track after the report: beside the fix in the native answer, instead of it in the others.
+        The target's track after the report. The native answer has both fix and track, other formats only the track.
 
     Raises
     ------

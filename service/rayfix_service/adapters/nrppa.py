@@ -1,4 +1,4 @@
-"""From NRPPa measurement results (3GPP TS 38.455) to a report."""
+"""Conversion of NRPPa measurement results (3GPP TS 38.455) into a report."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -58,10 +58,10 @@ def parse_nrppa(
     """Turn an NRPPa measurement message into a report.
 
     UL-AoA becomes an angle in the frame "north", since azimuths of the global coordinate system count from
-    geographic north, counter-clockwise (TS 38.215, clause 5.2.4); angles with a translation from a local
-    coordinate system are turned by it. UL-RTOA becomes a time of arrival: its reference time is the same for
-    all TRPs and unknown, as is the time of transmission. The Rx-Tx time differences of a gNB and of the UE add
-    to the round trip, so that c / 2 times their sum is the path length (TS 38.305, clause 8.10).
+    geographic north, counter-clockwise (TS 38.215, clause 5.2.4); angles with a translation from a local coordinate
+    system are rotated by it. UL-RTOA becomes a time of arrival: its reference time and the time of transmission are
+    unknown, and the same for all TRPs. The Rx-Tx time differences of a gNB and of the UE add to the round trip, so that
+    c / 2 times their sum is the path length (TS 38.305, clause 8.10).
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def parse_nrppa(
 
 
 def _check_counts(most: int, message: Mapping[str, Any]) -> None:
-    """Count the measurements of a message that need not be valid.
+    """Count the measurements of a message, which may be invalid.
 
     Raises
     ------
@@ -237,7 +237,7 @@ class _Converter:
             )
 
     def _time_variance(self, measured: Interval, quality: TimingQuality | LppTimingQuality | None) -> float:
-        """Variance of a time as a length, m2, that of its quantisation included."""
+        """Variance of a time as a length, m2, including that of the quantisation."""
         if quality is None:
             return self.document.time_stdev_m**2 + measured.variance
         return (_steps(quality.value) * _RESOLUTION_M[quality.resolution]) ** 2 + measured.variance
@@ -269,7 +269,7 @@ def _steps(quality: int) -> float:
 
 
 def _to_global(translation: LcsToGcs, angle: Angle) -> Angle:
-    """Turn an angle of a local coordinate system, and its covariance, by TR 38.901, equation (7.1-2)."""
+    """Rotate an angle of a local coordinate system, and its covariance, by TR 38.901, equation (7.1-2)."""
     orientation = (
         translation.alpha * ANGLE_STEP,
         translation.beta * ANGLE_STEP,
@@ -283,7 +283,7 @@ def _to_global(translation: LcsToGcs, angle: Angle) -> Angle:
         angle,
         azimuth=turned.azimuth,
         zenith=turned.zenith,
-        # Beyond a full turn an azimuth is unknown, which is the case right at the zenith.
+        # A standard deviation beyond a full turn means that the azimuth is unknown, as it is at the zenith.
         azimuth_stdev=min(float(stdev[0]), _TURN),
         zenith_stdev=min(float(stdev[1]), _TURN),
         correlation=float(np.clip(turned.cov[0, 1] / (stdev[0] * stdev[1]), -0.999, 0.999)),

@@ -1,8 +1,8 @@
 """NRPPa measurement results as JSON, with the names and ranges of the ASN.1 in 3GPP TS 38.455 V18.6.0, clause 9.3.5.
 
-A SEQUENCE is an object, a SEQUENCE OF an array, a CHOICE an object with one key. What the ASN.1 carries in an
-extension container (ZoA, MultipleULAoA, ReportingGranularitykminus1, LoS-NLoSInformation) stands under the name
-of its type. Keys that the conversion has no use for, such as timeStamp, may hold anything.
+A SEQUENCE is an object, a SEQUENCE OF an array, a CHOICE an object with one key. Elements of ASN.1 extension containers
+(ZoA, MultipleULAoA, ReportingGranularitykminus1, LoS-NLoSInformation) have the name of their type as key. Keys that the
+conversion does not use, such as timeStamp, may have any value.
 """
 
 from collections.abc import Mapping
@@ -72,7 +72,7 @@ class MultipleUlAoaItem(ChoiceModel):
 
 
 class MultipleUlAoa(WireModel):
-    """MultipleULAoA: up to 8 angles, each of a path of its own."""
+    """MultipleULAoA: up to 8 angles, each of a different path."""
 
     model_config = ConfigDict(title="MultipleULAoA")
 
@@ -87,7 +87,7 @@ def _time(k: int) -> Any:
 
 
 class TimeChoice(ChoiceModel):
-    """ULRTOAMeas and GNBRxTxTimeDiffMeas, which are alike: the step is Tc 2^k."""
+    """ULRTOAMeas and GNBRxTxTimeDiffMeas, which have the same form: the step is Tc 2^k."""
 
     model_config = ConfigDict(title="ULRTOAMeas")
 
@@ -313,7 +313,7 @@ class NrppaDocument(WireModel):
 
 
 class NrppaBatchDocument(WireModel):
-    """Many messages, answered in their order; each is read on its own."""
+    """Many messages, answered in their order; each is validated separately."""
 
     model_config = ConfigDict(title="NrppaBatch")
 
@@ -331,13 +331,13 @@ ELEMENTS = (
     "LMF-Measurement-ID",
     "RAN-Measurement-ID",
 )
-"""Information elements that the conversion reads or knows; others are passed over, as keys without use are."""
+"""Information elements that the conversion reads or accepts; others are ignored, like unused keys."""
 
 
 def unwrapped(message: Mapping[str, Any]) -> Mapping[str, Any]:
     """Take the information elements out of a whole PDU (TS 38.455, clause 9.3.3).
 
-    They come beside the keys that stand beside the PDU. A message that is no PDU stays as it is.
+    They are merged with the keys next to the PDU. A message that is not a PDU is returned unchanged.
 
     Raises
     ------

@@ -10,15 +10,15 @@ from rayfix_service.tracking.track import TrackedPosition
 from rayfix_tables.site import SiteInfo
 
 UNKNOWN_PROVIDER = "unknown"
-"""Provider id of a fix without a target, since a location must have one, and provider type of all."""
+"""Provider type of all locations, and provider id of a fix without a target, because a location must have one."""
 
 
 def fix_to_omlox(fix: Fix, site: SiteInfo, track: TrackedPosition | None = None) -> dict[str, Any]:
     """Describe the best candidate of a fix as an omlox Location.
 
-    The position is in the scene frame, so that ``crs`` is "local" and ``source``, the site's name, should be the
-    foreign id of the hub's zone. What the format has no place for stands in ``properties``. With a track, it is the
-    track's position, with ``speed`` and ``course``, the horizontal velocity and its bearing.
+    The position is in the scene frame, so ``crs`` is "local", and ``source``, the site's name, should be the foreign id
+    of the hub's zone. Values for which the format has no field are in ``properties``. With a track, the position is
+    that of the track, with ``speed`` and ``course``, the horizontal velocity and its bearing.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Sending positions to an omlox hub (omlox Hub API, version 2: ``PUT /providers/{provider_id}/location``).
 
-Locations wait in lanes, each sent one after the other, so that those of one target keep their order. Nothing here ever
-waits for the hub but the lanes: of a hub that is slow or gone, the oldest locations are dropped.
+Locations are queued in lanes. A lane sends one at a time, and all locations of a target use the same lane, which keeps
+them in order. Only the lanes wait for the hub. If it is slow or down, the oldest locations are dropped.
 """
 
 import asyncio
@@ -26,10 +26,10 @@ from rayfix_tables.site import SiteInfo
 _log = logging.getLogger(__name__)
 
 HubOutcome = Literal["sent", "refused", "dropped"]
-"""Outcome of a location: the hub accepted or refused it, or it was dropped since the queue or the time was used up."""
+"""Outcome of a location: accepted or refused by the hub, or dropped because the queue was full or time ran out."""
 
 _PASSING = frozenset({408, 425, 429, 500, 502, 503, 504})
-"""Statuses of a hub that may take the same location later."""
+"""Statuses after which the hub may accept the same location later."""
 
 
 class HubError(RayfixError):
@@ -47,17 +47,17 @@ class HubSettings:
     token : str or None
         Sent as ``Authorization: Bearer``.
     lanes : int
-        Locations that are on their way at a time.
+        Locations that are sent at the same time.
     capacity : int
         Locations that wait in each lane.
     attempts : int
-        Times that a location is sent at most.
+        Largest number of attempts for a location.
     first_pause, longest_pause : float, s
-        Before the second attempt, and at most; each is twice as long as that before.
+        Pause before the second attempt, and the longest pause; each is twice as long as the one before.
     timeout : float, s
-        From the beginning of an attempt to the end of the hub's answer, however the hub sends it.
+        From the start of an attempt to the end of the hub's answer, even if the hub sends it slowly.
     answer_bytes : int
-        Of an answer that are read, for the sake of the connection; nothing of them is used.
+        Bytes of an answer that are read, to keep the connection usable. They are not evaluated.
     """
 
     url: str
@@ -71,10 +71,10 @@ class HubSettings:
     answer_bytes: int = 4096
 
     def __post_init__(self) -> None:
-        """Refuse what is no address."""
+        """Check the address."""
         parts = urlsplit(self.url)
         if parts.scheme not in ("http", "https") or not parts.netloc or parts.query or parts.fragment:
-            raise HubError(f"omlox hub {self.url!r} is no address; give that of its API, e.g. http://hub:8081/v2")
+            raise HubError(f"omlox hub {self.url!r} is not an address; give that of its API, e.g. http://hub:8081/v2")
 
 
 class OmloxHub:
@@ -84,7 +84,7 @@ class OmloxHub:
     ----------
     settings : HubSettings
     on_outcome : callable, optional
-        Called with what became of each location.
+        Called with the outcome of each location.
     """
 
     def __init__(self, settings: HubSettings, *, on_outcome: Callable[[HubOutcome], None] | None = None) -> None:
@@ -94,12 +94,12 @@ class OmloxHub:
         self._failing = False
 
     def tell(self, fix: Fix, site: SiteInfo, track: TrackedPosition | None = None) -> None:
-        """Send the position of a track or else of a fix, if there is one, and return at once."""
+        """Queue the position of a track, or of a fix without one, if there is a position; returns at once."""
         if track is not None or (fix.candidates and fix.regions is not None):
             self.put(fix_to_omlox(fix, site, track))
 
     def put(self, location: dict[str, Any]) -> None:
-        """Send a location and return at once."""
+        """Queue a location and return at once."""
         lane = self._lanes[zlib.crc32(location["provider_id"].encode("utf-8", "surrogatepass")) % len(self._lanes)]
         if len(lane.waiting) == self._settings.capacity:
             lane.waiting.popleft()
@@ -109,7 +109,7 @@ class OmloxHub:
 
     @property
     def num_waiting(self) -> int:
-        """Locations that wait or are on their way."""
+        """Number of locations that are queued or being sent."""
         return sum(len(lane.waiting) + lane.sending for lane in self._lanes)
 
     async def run(self) -> None:
@@ -169,12 +169,12 @@ class OmloxHub:
         return "dropped"
 
     async def _put(self, client: httpx.AsyncClient, url: str, location: dict[str, Any]) -> int:
-        """Make one attempt; returns the status, which counts even if the rest of the answer is long or does not come.
+        """Make one attempt and return the status. It is valid even if the rest of the answer is long or missing.
 
         Raises
         ------
         TimeoutError, httpx.HTTPError
-            When there is no status in time.
+            When no status arrives in time.
         """
         status = None
         try:
@@ -193,7 +193,7 @@ class OmloxHub:
         return status
 
     def _tell_once(self, *, failing: bool, reason: str) -> None:
-        """Log the first failure of several, and their end."""
+        """Log the first of several failures in a row, and the first success after them."""
         if failing and not self._failing:
             _log.warning("the omlox hub %s does not take positions: %s", self._settings.url, reason)
         elif self._failing and not failing:
@@ -203,7 +203,7 @@ class OmloxHub:
 
 @dataclass
 class _Lane:
-    """Locations in their order, and whether one is on its way."""
+    """Queued locations in order, and whether one is being sent."""
 
     waiting: deque[dict[str, Any]] = field(default_factory=deque)
     filled: asyncio.Event = field(default_factory=asyncio.Event)
@@ -217,9 +217,9 @@ async def open_hub(
     on_outcome: Callable[[HubOutcome], None] | None = None,
     cooperation: float = 2.0,
 ) -> AsyncIterator[OmloxHub | None]:
-    """Send in the background while the context lasts, and what waits then for `patience` seconds more.
+    """Send in the background inside the context; on exit, send the queued locations for up to `patience` seconds.
 
-    Without settings there is no hub, and None.
+    Yields None without settings.
     """
     if settings is None:
         yield None

@@ -1,4 +1,4 @@
-"""What formats that know one position alone take from a fix, or from the track that it went into."""
+"""The single position of a fix or of its track, for output formats that cannot express several candidates."""
 
 from rayfix_service.fusion.posterior.credible import CredibleRegions
 from rayfix_service.fusion.posterior.fix import Candidate, Fix

@@ -1,7 +1,7 @@
 """Report mappings of 3GPP TS 38.133, clause 13: from integers to times and angles.
 
-A reported integer stands for an interval of the measured quantity. The interval's middle is taken for the
-quantity, and the variance of a uniform distribution over it, width^2 / 12, adds to that of the measurement.
+A reported integer stands for an interval of the measured quantity. The quantity is taken to be the middle of the
+interval. The variance of a uniform distribution over it, width^2 / 12, is added to that of the measurement.
 """
 
 import math

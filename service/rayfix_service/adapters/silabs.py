@@ -1,7 +1,7 @@
-"""From the angles of Silicon Labs' Bluetooth locators to a report.
+"""Conversion of angles from Silicon Labs' Bluetooth locators into a report.
 
 A locator publishes one JSON object per packet that it received (Bluetooth SDK, ``aoa_serialize_angle``): degrees and
-metres, with the sequence number of the packet. Locator and tag are named by the MQTT topic alone.
+metres, with the sequence number of the packet. Only the MQTT topic names locator and tag.
 """
 
 import math
@@ -22,11 +22,11 @@ from rayfix_tables.validation.problems import Path
 _Stdev = Field(ge=0, le=360, description="a standard deviation in degrees, 0 to 360")
 
 LEAST_STDEV_DEG = 0.5
-"""Locators estimate the noise of an angle, not the error of their array; no smaller deviation is believed."""
+"""Smallest standard deviation that is used: locators estimate the noise of an angle, not the error of their array."""
 
 
 class SilabsAngle(WireModel):
-    """What a locator publishes for one packet; keys that later versions of its software add are passed over."""
+    """The message that a locator publishes for one packet. Unknown keys, which later software may add, are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -51,13 +51,13 @@ class SilabsAngle(WireModel):
 
 
 class SilabsLocatorAngle(SilabsAngle):
-    """The same with the locator, which the topic names in MQTT."""
+    """The same with the locator's name, which in MQTT is part of the topic."""
 
     locator_id: str = Field(min_length=1, max_length=128, description="the locator's name, 1 to 128 characters")
 
 
 class SilabsDocument(WireModel):
-    """The angles that locators measured of one packet of one tag."""
+    """The angles that several locators measured for one packet of a tag."""
 
     model_config = ConfigDict(title="SilabsReport")
 
@@ -76,7 +76,7 @@ class SilabsDocument(WireModel):
 
 
 class SilabsBatchDocument(WireModel):
-    """The angles of many packets, answered in their order; each is read on its own."""
+    """The angles of many packets, answered in their order; each packet is validated separately."""
 
     model_config = ConfigDict(title="SilabsBatch")
 
@@ -141,10 +141,10 @@ def parse_silabs_angle(payload: bytes) -> SilabsAngle:
 def silabs_measurements(
     angle: SilabsAngle, station_id: str, *, frame: Frame = "lcs", least_stdev_deg: float = LEAST_STDEV_DEG
 ) -> tuple[Measurement, ...]:
-    """Turn one locator's angle into measurements: the azimuth's sign changes, and zenith = 90 deg - elevation.
+    """Convert one locator's angle into measurements: the azimuth changes its sign, and zenith = 90 deg - elevation.
 
-    The distance, which locators guess from the signal strength, counts as a propagation time where it comes with
-    a positive deviation; the least deviation applies to angles alone.
+    The distance, which locators estimate from the signal strength, becomes a propagation time if it has a positive
+    standard deviation. The smallest standard deviation applies to angles only.
     """
     least = math.radians(least_stdev_deg)
     measured = Angle(

@@ -15,17 +15,17 @@ from rayfix_tables.site import SiteInfo
 _log = logging.getLogger(__name__)
 
 PAYLOAD_BYTES = 64 << 10
-"""Bytes that a message may have, where nothing else is set; an angle has some hundred."""
+"""Default limit of a message, bytes; an angle has about a hundred."""
 
 _MOST_PACKETS = 20_000
-"""Packets that wait for more locators, and that are remembered as ended; beyond that, the oldest end early."""
+"""Largest number of packets that wait for locators, and of ended packets that are remembered; the oldest end early."""
 
 _MOST_SOURCES = 1000
-"""Locators that are remembered as logged; the number of a broker's topics is not bounded."""
+"""Largest number of locators that are remembered as logged, because a broker may have any number of topics."""
 
 
 class SilabsStream:
-    """Takes messages of topics that end in ``<locator>/<tag>``, and gives a report for each packet of a tag.
+    """Joins messages of topics that end in ``<locator>/<tag>`` into one report for each packet of a tag.
 
     A message that cannot be used is skipped and counted; the first one of each locator is logged. One that is
     delivered twice, as MQTT may with quality of service 1, is taken once.
@@ -33,15 +33,15 @@ class SilabsStream:
     Parameters
     ----------
     site : SiteInfo
-        Its stations are those that may measure; a packet's report is complete when all have.
+        A packet's report is complete when all of its stations have measured.
     window : float, s
         How long a packet waits for more locators.
     stations : Mapping, optional
-        Stations by locator; a locator that it does not have is itself a station's identifier.
+        Stations by locator; a locator that is not in the map is itself a station's identifier.
     frame : {"lcs", "scene", "north"}
         Frame of the angles.
     least_stdev_deg : float, deg
-        Least standard deviation to believe.
+        Smallest standard deviation that is used.
     height : Height, optional
         What is known of the height of all tags.
     payload_bytes : int
@@ -90,28 +90,30 @@ class SilabsStream:
             self._joiner.expect(len(self._known))
 
     def receive(self, topic: str, payload: bytes, now: float) -> list[Adapted]:
-        """Take a message that arrived at `now`, s of any clock; returns the reports that it completes."""
+        """Process a message that arrived at `now`, s of any clock, and return the reports that it completes."""
         levels = topic.split("/")
         if len(levels) < 2 or not (levels[-2] and levels[-1]):
-            self._tell(topic, f"the topic '{in_log(topic)}' does not end in <locator>/<tag>; subscribe to others")
+            self._log_skipped(
+                topic, f"the topic '{in_log(topic)}' does not end in <locator>/<tag>; subscribe to others"
+            )
             return []
         locator, tag = levels[-2:]
         if len(tag) > MAX_NAME:
-            self._tell(locator, f"the tag '{in_log(tag)}' has {len(tag)} characters; give it at most {MAX_NAME}")
+            self._log_skipped(locator, f"the tag '{in_log(tag)}' has {len(tag)} characters; give it at most {MAX_NAME}")
             return []
         if len(payload) > self._payload_bytes:
-            self._tell(locator, f"the message has {len(payload)} bytes; an angle may have {self._payload_bytes}")
+            self._log_skipped(locator, f"the message has {len(payload)} bytes; an angle may have {self._payload_bytes}")
             return []
         station_id = station_of(locator, self._stations)
         if station_id not in self._known:
-            self._tell(
+            self._log_skipped(
                 locator, f"station '{in_log(station_id)}' is not in the table; name one, or map the locator to one"
             )
             return []
         try:
             angle = parse_silabs_angle(payload)
         except ReportError as error:
-            self._tell(locator, in_log(str(error), most=1000))
+            self._log_skipped(locator, in_log(str(error), most=1000))
             return []
         moment = datetime.now(UTC)
         return self._reports(self._joiner.add(tag, station_id, angle.sequence, (moment, angle), now))
@@ -137,7 +139,7 @@ class SilabsStream:
             list(measurements), [], target_id=transmission.target, timestamp=timestamp, height=self._height
         )
 
-    def _tell(self, source: str, text: str) -> None:
+    def _log_skipped(self, source: str, text: str) -> None:
         self.num_passed_over += 1
         source = in_log(source)
         level = logging.DEBUG if source in self._told or len(self._told) >= _MOST_SOURCES else logging.WARNING
@@ -147,5 +149,5 @@ class SilabsStream:
 
 
 def _same_angle(before: tuple[datetime, SilabsAngle], after: tuple[datetime, SilabsAngle]) -> bool:
-    """Tell whether an angle is the one that its locator sent before."""
+    """Whether an angle is the same message that its locator sent before."""
     return before[1] == after[1]

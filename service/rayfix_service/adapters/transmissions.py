@@ -11,7 +11,7 @@ T = TypeVar("T")
 Key = tuple[str, int | None]
 
 _SLACK = 1000
-"""Entries of a heap that may be out of date, beside as many as are not, before it is made anew."""
+"""A heap is rebuilt when it has this many more outdated entries than valid ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class Transmission(Generic[T]):
     heard : dict
         Measurement of each station, by the station's name, in the order of arrival.
     started : float, s
-        When the first of it arrived.
+        When the first measurement arrived.
     """
 
     target: str
@@ -35,10 +35,9 @@ class Transmission(Generic[T]):
 class Joiner(Generic[T]):
     """Collects messages into transmissions, by sequence number where there is one, else by time.
 
-    A transmission ends when `num_stations` have measured it, when one of its stations measures again, or
-    `window` seconds after its first message. A message that comes later than that is dropped; a sequence number
-    is taken for a new transmission again after ten windows. The time for a message does not grow with those that
-    came before.
+    A transmission ends when `num_stations` have measured it, when one of its stations measures again, or `window`
+    seconds after its first message. Later messages of it are dropped. After ten windows, the same sequence number
+    starts a new transmission. The time for a message does not grow with the number of earlier messages.
 
     Parameters
     ----------
@@ -47,10 +46,10 @@ class Joiner(Generic[T]):
     num_stations : int, optional
         How many stations there are.
     repeats : callable, optional
-        Whether a message of a station is the one that it sent before, delivered twice. Such a message is dropped and
-        counted; it does not end the transmission.
+        Whether a message of a station is its previous one, delivered twice. Such a message is dropped and counted, and
+        does not end the transmission.
     most : int, optional
-        Transmissions that are remembered at a time. When there are more, the oldest ends before its window.
+        Largest number of transmissions that are remembered. When there are more, the oldest one ends early.
 
     Attributes
     ----------
@@ -86,7 +85,7 @@ class Joiner(Generic[T]):
         self._num_stations = num_stations
 
     def add(self, target: str, station: str, sequence: int | None, message: T, now: float) -> list[Transmission[T]]:
-        """Take a message that arrived at `now`, s; returns the transmissions that it ends."""
+        """Process a message that arrived at `now`, s, and return the transmissions that it ends."""
         ended = self.due(now)
         key = (target, sequence)
         if now < self._ended.get(key, now):

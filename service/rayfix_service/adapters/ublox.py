@@ -1,4 +1,4 @@
-"""From the ``+UUDF`` lines of u-blox direction-finding anchors (NINA-B4 with u-connectLocate) to reports."""
+"""Conversion of ``+UUDF`` lines of u-blox direction-finding anchors (NINA-B4 with u-connectLocate) into reports."""
 
 import csv
 import math
@@ -19,18 +19,18 @@ from rayfix_tables.validation.problems import Path, shown
 _PREFIX = "+UUDF:"
 
 _TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d{1,9})?(?:Z|[+-]\d\d:?\d\d)?")
-"""A log's time before an event: ISO 8601, UTC where it names no zone."""
+"""Time that a log writes before an event: ISO 8601, UTC unless it has a time zone."""
 
 _LISTED = 20
-"""Lines that cannot be read are listed one by one up to this many; the others are counted."""
+"""Largest number of unreadable lines that are listed; further ones are only counted."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AngleErrors:
     """Errors of anchors' angles, which the anchors do not report.
 
-    The defaults are those of recorded angles indoors (docs/real-data.md): most errors have a standard deviation of some
-    10 deg, one in five is of a distribution three times as wide.
+    The defaults are fitted to angles recorded indoors (docs/real-data.md): four of five errors have a standard
+    deviation of about 10 deg, and one in five has a distribution three times as wide.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class AngleErrors:
     tail_share : float
         Probability that the error is of the wider Gaussian.
     tail_scale : float
-        Standard deviation of the wider Gaussian, in those of the other.
+        Standard deviation of the wider Gaussian divided by that of the narrower one.
 
     Raises
     ------
@@ -87,7 +87,7 @@ class UudfEvent:
     timestamp_ms : int
         Time since the anchor booted; clocks of anchors differ.
     sequence : int or None
-        Periodic advertising sequence number, the same for all anchors; older firmware does not give it.
+        Periodic advertising sequence number, the same for all anchors; None from older firmware.
     """
 
     tag: str
@@ -142,7 +142,7 @@ def parse_uudf(line: str) -> UudfEvent:
 
 
 def ublox_angle(event: UudfEvent, station_id: str, *, errors: AngleErrors = USUAL_ERRORS) -> Angle:
-    """Turn an event into an angle of the anchor's local frame, whose x axis is the boresight."""
+    """Convert an event into an angle in the anchor's local frame, where the boresight is the x axis."""
     stdev = math.radians(errors.stdev_deg)
     return Angle(
         station_id=station_id,
@@ -157,7 +157,7 @@ def ublox_angle(event: UudfEvent, station_id: str, *, errors: AngleErrors = USUA
 
 @dataclass(frozen=True, kw_only=True)
 class _Line:
-    """An event, the number of its line, and the time that the line has before it."""
+    """An event, its line number, and the time before it in the line."""
 
     number: int
     event: UudfEvent
@@ -173,20 +173,19 @@ def parse_ublox(
 ) -> tuple[Adapted, ...]:
     """Turn the lines of several anchors into reports, one for each transmission of each tag.
 
-    Lines with one sequence number belong together. Where there is none, an anchor that reports a tag again begins
-    that tag's next report: anchors' clocks differ. What stands before ``+UUDF:`` in a line is not read, except for a
-    log's time. A line without an event, or whose event is not valid, is left out; the first report lists it in what it
-    skips.
+    Lines with the same sequence number belong together. Without sequence numbers, a tag's next report begins when an
+    anchor reports the tag again, because anchors' clocks differ. Text before ``+UUDF:`` in a line is ignored, except
+    for a log's time. A line without a valid event is left out; the first report lists it as skipped.
 
-    A report's time is that of its first line in the log. Where lines have none, it is counted back from ``received``,
-    the time of the last line, by the clocks of the anchors; without ``received`` the report has no time.
+    A report's time is that of its first line in the log. If lines have no time, it is counted back from ``received``,
+    the time of the last line, by the anchors' clocks. Without ``received``, the report has no time.
 
     Parameters
     ----------
     text : str or bytes
         Lines in UTF-8.
     stations : Mapping, optional
-        Stations by anchor id; an anchor that it does not have is itself a station's identifier.
+        Stations by anchor id; an anchor that is not in the map is itself a station's identifier.
     errors : AngleErrors, optional
     received : datetime, optional
         When the lines were received, with a time zone.
@@ -240,7 +239,7 @@ def parse_ublox(
 
 
 def _logged(before: str) -> datetime | None:
-    """Read the time that a log writes before an event, the last one where there are several."""
+    """Read the time that a log writes before an event; of several, the last one."""
     found = _TIME.findall(before)
     if not found:
         return None
@@ -252,23 +251,23 @@ def _logged(before: str) -> datetime | None:
 
 
 def _time_of(lines: Sequence[_Line], latest: Mapping[str, int], received: datetime | None) -> str | None:
-    """Return the time of a transmission, RFC 3339, or None where nothing says it.
+    """Return the time of a transmission, RFC 3339, or None if it is unknown.
 
     Parameters
     ----------
     lines : sequence of _Line
         Of the transmission.
     latest : Mapping
-        Milliseconds since its start at which each anchor sent its last line.
+        Time of each anchor's last line, in milliseconds since that anchor started.
     received : datetime or None
-        When the last line came.
+        When the last line was received.
     """
     logged = [line.logged for line in lines if line.logged is not None]
     if logged:
         return min(logged).isoformat()
     if received is None:
         return None
-    # An anchor that started anew in between counts from zero again; its lines are then taken for the latest.
+    # An anchor that restarted in between counts from zero again; its lines are then taken to be the latest.
     back = max(latest[line.event.anchor] - line.event.timestamp_ms for line in lines)
     return (received - timedelta(milliseconds=max(back, 0))).isoformat()
 

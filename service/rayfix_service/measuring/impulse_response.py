@@ -10,10 +10,10 @@ from rayfix_service.measuring.ranging import SPEED_OF_LIGHT, RangeEstimate
 from rayfix_tables.errors import ReportError
 
 _OVERSAMPLING = 4
-"""Places between two taps at which the response is looked at before its maximum is found exactly."""
+"""Samples between two taps at which the response is evaluated before its maximum is refined."""
 
 _NOISE_MARGIN = 4.0
-"""A first path stands out of the noise by at least this many of its standard deviations."""
+"""A first path exceeds the noise by at least this many of its standard deviations."""
 
 
 def range_from_impulse_response(
@@ -28,9 +28,9 @@ def range_from_impulse_response(
 ) -> RangeEstimate:
     """Path length of the strongest or the first path of a channel impulse response.
 
-    The taps are interpolated as the band-limited, periodic signal that they are samples of (an OFDM receiver's are
-    exactly that), and the delay is where its magnitude has a maximum. The first path is looked for with a Hann window
-    over the band, whose side lobes are 31 dB down; those of the bare band, 13 dB down, would pass for paths.
+    The taps are interpolated as samples of a band-limited, periodic signal, which is exact for an OFDM receiver. The
+    delay is a maximum of its magnitude. The search for the first path uses a Hann window over the band, with side lobes
+    at -31 dB; without a window, side lobes at -13 dB would be mistaken for paths.
 
     Parameters
     ----------
@@ -38,12 +38,12 @@ def range_from_impulse_response(
         The first at ``first_tap_delay``, the others every ``1 / sampling_rate``; at least 8.
     sampling_rate : float, Hz
     path : {"strongest", "first"}
-        Whichever the table's path prior speaks of: ``"power"`` prefers the strongest.
+        Choose the one that the table's path prior assumes: ``"power"`` prefers the strongest.
     bandwidth : float, Hz, optional
-        Of the signal, about the middle of the sampled band; the sampling rate when left out.
+        Bandwidth of the signal, centred in the sampled band; by default the sampling rate.
     noise_power : float, optional
-        Mean of ``|noise|^2`` of a tap; estimated from the median tap when left out, which needs more taps without paths
-        than with.
+        Mean of ``|noise|^2`` of a tap; by default estimated from the median tap, which requires that most taps have no
+        path.
     dynamic_range_db : float
         A first path is at most this much weaker than the strongest.
     first_tap_delay : float, s
@@ -51,13 +51,13 @@ def range_from_impulse_response(
     Returns
     -------
     RangeEstimate
-        Its deviation is that of the noise alone: paths that arrive within about ``c / bandwidth`` of each other disturb
-        one another by more, for which add what your receiver is known for.
+        Its standard deviation is due to noise only. Paths whose lengths differ by less than about ``c / bandwidth``
+        interfere and cause larger errors; add the known error of your receiver.
 
     Raises
     ------
     ReportError
-        When the taps or the rates cannot be.
+        When the taps or the rates are not valid.
 
     Notes
     -----
@@ -73,7 +73,7 @@ def range_from_impulse_response(
             f"bandwidth is {bandwidth:g} Hz; give one between 0 and the sampling rate, {sampling_rate:g} Hz"
         )
     if noise_power is None:
-        # Of complex Gaussian noise the squares are exponential: their median is log 2 of their mean.
+        # The squares of complex Gaussian noise are exponentially distributed: the median is the mean times log 2.
         noise_power = float(np.median(np.abs(values) ** 2)) / math.log(2.0)
     if not (math.isfinite(noise_power) and noise_power > 0.0):
         raise ReportError(f"noise_power is {noise_power}; give the mean power of the noise of a tap")
@@ -83,7 +83,7 @@ def range_from_impulse_response(
     window = band * (1.0 if path == "strongest" else 0.5 + 0.5 * np.cos(2.0 * np.pi * frequency / bandwidth))
     spectrum, omega = window * np.fft.fft(values) / count, np.asarray(2.0 * np.pi * frequency, np.float64)
     step = 1.0 / (sampling_rate * _OVERSAMPLING)
-    # From one tap before the first: noise may push a path there.
+    # The search begins one tap before the first, where noise may shift a path.
     times = step * np.arange(-_OVERSAMPLING, _OVERSAMPLING * (count - 1))
     power = np.abs(np.exp(1j * np.outer(times, omega)) @ spectrum) ** 2
     start = int(np.argmax(power))
@@ -93,7 +93,7 @@ def range_from_impulse_response(
         above = (power[1:-1] >= least) & (power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])
         start = int(np.flatnonzero(above)[0]) + 1 if above.any() else start
     delay = _maximum(spectrum, omega, float(times[start]), step)
-    # The noise of a frequency, and the amplitude of the path in it; both in units of the taps.
+    # Noise at one frequency, and the path's amplitude there; both in units of the taps.
     noise_per_bin = noise_power / np.count_nonzero(band)
     amplitude = abs(np.exp(1j * omega * delay) @ spectrum) / float(window.sum())
     bend = float((window * omega**2).sum())
@@ -113,14 +113,14 @@ def _checked_taps(taps: ArrayLike) -> NDArray[np.complex128]:
 
 
 def _maximum(spectrum: NDArray[np.complex128], omega: NDArray[np.float64], start: float, reach: float) -> float:
-    """Time at which the magnitude of a signal has its maximum, by Newton's steps from nearby, s."""
+    """Time of the maximum of a signal's magnitude, by Newton's method from a nearby start, s."""
     time = start
     for _ in range(20):
         turned = np.exp(1j * omega * time) * spectrum
         value, slope, bend = turned.sum(), (1j * omega * turned).sum(), (-(omega**2) * turned).sum()
         first = (np.conj(value) * slope).real
         second = abs(slope) ** 2 + (np.conj(value) * bend).real
-        # Where the magnitude is not concave, uphill by half of what there is left.
+        # Where the magnitude is not concave: uphill by half of the remaining interval.
         step = -first / second if second < 0.0 else math.copysign(0.5 * reach, first)
         moved = min(max(time + step, start - reach), start + reach)
         if abs(moved - time) <= 1e-9 * reach:

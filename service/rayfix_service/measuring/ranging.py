@@ -1,6 +1,6 @@
 """Path lengths from what radios measure: times, round trips and signal strengths.
 
-Pure functions; what they return goes into a report as :class:`~rayfix_service.fusion.measurements.report.Range` or
+Pure functions. Their results go into a report as :class:`~rayfix_service.fusion.measurements.report.Range` or
 :class:`~rayfix_service.fusion.measurements.report.LogRange`. docs/measurements.md says when to use which.
 """
 
@@ -28,7 +28,7 @@ class LogRangeEstimate:
     Attributes
     ----------
     path_length : float, m
-        The median of what is measured at this path length.
+        Median of the measurements at this path length.
     log_stdev : float
         Standard deviation of the natural logarithm.
     """
@@ -50,7 +50,7 @@ def range_from_times(*, toa: float, tod: float, stdev: float) -> RangeEstimate:
 
 
 def range_from_round_trip(*, round_trip: float, reply: float, stdev: float) -> RangeEstimate:
-    """Path length from the time that a signal and its reply take (two-way ranging).
+    """Path length from the times of a signal and its reply (two-way ranging).
 
     Parameters
     ----------
@@ -70,8 +70,7 @@ def range_from_rssi(
     """Path length from a signal strength by the log-distance model with log-normal shadowing.
 
     ``rssi = power_at_1m - 10 n log10(d) + X``, X Gaussian: the error of log d is Gaussian, so that of d is relative,
-    not additive. The path length returned is the median; the mean of the distances at which the same strength is
-    measured is larger.
+    not additive. The result is the median; the mean of the distances with the same signal strength is larger.
 
     Parameters
     ----------

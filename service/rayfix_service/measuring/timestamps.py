@@ -1,18 +1,18 @@
-"""Date-times of reports as moments."""
+"""Timestamps of reports."""
 
 import re
 from datetime import UTC, datetime, timedelta
 
 
 def utc_moment(timestamp: str) -> datetime:
-    """Turn a date-time of RFC 3339 into a moment in UTC, to the microsecond.
+    """Convert an RFC 3339 date-time into a datetime in UTC, to the microsecond.
 
-    Which its offset puts before the year 1 or after 9999 becomes the first or last moment that there is.
+    A time that lies before the year 1 or after 9999 in UTC becomes the earliest or latest datetime.
     """
-    # Python knows no leap seconds.
+    # Python has no leap seconds.
     leap = re.match(r"(.{17})60", timestamp)
     text = f"{leap[1]}59{timestamp[19:]}" if leap else timestamp
-    # Nor more than six digits of a second.
+    # It accepts at most six digits of a second.
     text = re.sub(r"(\.[0-9]{6})[0-9]+", r"\1", text.upper())
     moment = datetime.fromisoformat(text)
     try:
@@ -22,5 +22,5 @@ def utc_moment(timestamp: str) -> datetime:
 
 
 def utc_milliseconds(timestamp: str) -> str:
-    """Write a date-time of RFC 3339 in UTC with milliseconds."""
+    """Format a datetime as RFC 3339, in UTC with milliseconds."""
     return utc_moment(timestamp).isoformat(timespec="milliseconds").replace("+00:00", "Z")

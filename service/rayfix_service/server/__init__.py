@@ -1,1 +1,1 @@
-"""The application composed of its parts, and the processes that serve it."""
+"""Composition of the application, and the processes that serve it."""

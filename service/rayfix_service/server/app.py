@@ -60,10 +60,10 @@ the station towards the incoming ray. Every error is a problem document (RFC 945
 
 
 class RayfixApp(FastAPI):
-    """FastAPI with this service's middlewares around all that FastAPI has.
+    """FastAPI with this service's middlewares outside of FastAPI's own.
 
-    What they answer by themselves goes past FastAPI's own middlewares, which take 4 us of each request. The OpenAPI
-    document also has the schemas of the bodies that the routes read themselves.
+    Responses of these middlewares bypass FastAPI's own, which take 4 us per request. The OpenAPI document also has the
+    schemas of the bodies that the routes parse themselves.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -75,7 +75,7 @@ class RayfixApp(FastAPI):
         await self._outermost(scope, receive, send)
 
     def surround(self, middleware: Callable[..., ASGIApp], **options: Any) -> None:
-        """Put a middleware around all others."""
+        """Add a middleware outside of all others."""
         self._outermost = middleware(self._outermost, **options)
 
     def openapi(self) -> dict[str, Any]:
@@ -104,7 +104,7 @@ class RayfixApp(FastAPI):
 
 
 def _describe_parameters(document: dict[str, Any]) -> None:
-    """Add to an OpenAPI document that every path refuses query parameters that it does not know."""
+    """Document in OpenAPI that every path refuses unknown query parameters."""
     refusals = {str(status): response for status, response in problem_responses(INVALID_PARAMETER).items()}
     for operations in document["paths"].values():
         for operation in operations.values():
@@ -118,20 +118,20 @@ def create_app(
     at_hand: dict[str, ServedTable] | None = None,
     accounts: Accounts | None = None,
 ) -> FastAPI:
-    """Make the web application that answers from one table or several.
+    """Create the web application that serves one or several tables.
 
-    It listens at once; ``/livez`` answers. Meanwhile a thread verifies the tables and compiles the kernels; then
-    ``/readyz`` turns 200 and the other routes answer. Afterwards it watches the tables' files.
+    It listens at once and answers ``/livez`` while a thread verifies the tables and compiles the kernels. Then
+    ``/readyz`` returns 200 and the other routes answer. Afterwards it watches the tables' files for changes.
 
     Parameters
     ----------
     tables_path : pathlib.Path
-        The table, or a folder of tables. One that does not pass its check leaves the application not ready.
+        The table, or a folder of tables. While a single table fails its check, the application is not ready.
     settings : ServiceSettings, optional
     at_hand : dict of str to ServedTable, optional
-        Tables that are verified already, by name; they answer at once. The application takes them out.
+        Tables that are already verified, by name; they are served at once. The application removes them from the dict.
     accounts : Accounts, optional
-        Of the clients' rates, which may be common to several processes.
+        Accounts of the clients' rates, which several processes may share.
 
     Raises
     ------
@@ -215,17 +215,17 @@ def create_app(
         lifespan=lifespan,
         dependencies=[Depends(refuse_unknown_parameters)],
         openapi_url=None,  # routes_assets has a route with the examples of the table and the proxy's path
-        docs_url=None,  # FastAPI's own page gets its script from elsewhere; routes_assets has one that does not
+        docs_url=None,  # FastAPI's page loads its script from another host; the page of routes_assets does not
         redoc_url=None,
         redirect_slashes=False,  # a redirected POST loses its body in many clients; a 404 is clear
-        # The figures are those of /metrics; and to ask at each request whether others are wanted takes long.
+        # /metrics has all metrics, and checking at each request for other telemetry is slow.
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
     install_problems(app)
     app.surround(FastPath, path="/v1/positions", answer=partial(positions.answer_position, app.state))
     app.surround(Access, keys=keys, limit=_rate_limit(settings, accounts))
     if settings.cors_origins:
-        # Around the access control, since a browser asks without a key whether it may send one.
+        # Outside of the access control, because a browser's preflight request has no key.
         app.surround(
             CORSMiddleware,
             allow_origins=settings.cors_origins,
@@ -255,7 +255,7 @@ def _rate_limit(settings: ServiceSettings, accounts: Accounts | None) -> RateLim
 
 
 async def _keep_keys(keys: ApiKeys, seconds: float) -> None:
-    """Read the keys again from time to time; while their file cannot be used, the previous ones stay valid."""
+    """Reload the keys periodically; while their file cannot be used, the previous keys stay valid."""
     failure, is_settled = "", True
     while True:
         await asyncio.sleep(seconds if is_settled else min(seconds, _SECOND_LOOK_SECONDS))
@@ -302,8 +302,8 @@ async def _freeze(tables: Tables) -> None:
 async def _take_turn(tables: Tables, marker: Path, stopping: asyncio.Event) -> None:
     """Let a worker that replaces another listen only once it can locate.
 
-    Until then the others take all connections. Of the first workers none waits, so that ``/livez`` answers; a file in
-    the folder that they share tells that there was one that could locate.
+    Until then the other workers take all connections. The first workers do not wait, so ``/livez`` answers at once. A
+    file in their shared folder marks that some worker has been able to locate.
     """
     if marker.exists():
         waiting = [asyncio.create_task(event.wait()) for event in (tables.became_ready, stopping)]

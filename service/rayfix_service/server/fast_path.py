@@ -1,4 +1,4 @@
-"""A path past the router for the most frequent route."""
+"""A shortcut past the router for the most frequent route."""
 
 from collections.abc import Awaitable, Callable
 
@@ -11,8 +11,8 @@ from rayfix_tables.errors import ReportError
 class FastPath:
     """Middleware that answers one kind of request by itself: POST to a path, without a query.
 
-    FastAPI needs, to find the route, its parameters and its dependencies, a considerable fraction of
-    what a fix does. The route itself stays: it answers requests with a query, and makes the OpenAPI document.
+    FastAPI's resolution of route, parameters and dependencies takes a considerable fraction of the time of a fix. The
+    route remains for requests with a query and for the OpenAPI document.
 
     Parameters
     ----------
@@ -20,8 +20,8 @@ class FastPath:
         Answers everything else.
     path : str
     answer : callable
-        Gets the request's scope and what receives its body, and returns the body of the answer and its media type; may
-        raise what the routes may.
+        Takes the request's scope and its receive function, and returns the response's body and media type. May raise
+        the same exceptions as the routes.
     """
 
     def __init__(
@@ -36,13 +36,13 @@ class FastPath:
         if scope["type"] != "http" or scope["path"] != self.path or scope["method"] != "POST" or scope["query_string"]:
             await self._app(scope, receive, send)
             return
-        scope["route"] = self  # its path is the label of the figures
+        scope["route"] = self  # its path is the label of the metrics
         try:
             body, media_type = await self._answer(scope, receive)
         except (ProblemError, ReportError) as error:
             await error_response(error)(scope, receive, send)
             return
-        # As Starlette's Response does, which takes longer to make than this.
+        # The same as Starlette's Response, which takes longer to construct.
         headers = [(b"content-length", str(len(body)).encode()), (b"content-type", media_type.encode())]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         await send({"type": "http.response.body", "body": body})

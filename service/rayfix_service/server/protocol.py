@@ -1,6 +1,6 @@
-"""The HTTP protocol of the server: uvicorn's, with answers written in one piece at the end of the loop's turn.
+"""The server's HTTP protocol: uvicorn's, with buffered writes at the end of an iteration of the event loop.
 
-It also holds each connection to :class:`~rayfix_service.http.settings.ConnectionLimits`, which uvicorn does not.
+It also enforces :class:`~rayfix_service.http.settings.ConnectionLimits`, which uvicorn does not have.
 """
 
 import asyncio
@@ -17,41 +17,41 @@ from rayfix_service.http.problems import MEDIA_TYPE, OVERLOADED, problem_documen
 from rayfix_service.http.settings import ConnectionLimits
 from rayfix_service.http.telemetry.connections import NOTE, Closed, Crowd
 
-_MOST_HELD = 1 << 16  # bytes; what is long is worth a system call, and the flow control has to know of it
+_MOST_HELD = 1 << 16  # bytes; longer data justify a system call, and the flow control must see them
 
-_PIECE = 1 << 16  # bytes that the parser gets at once
-_MOST_PIPELINED = 100  # requests that wait for the answer to one before them, on one connection
-_SMALL_REST = 1 << 16  # bytes of a body that nobody reads, for which it does not pay to end the connection
-_LINGER_SECONDS = 2.0  # for a client that still sends, or that has not read all, when its connection ends
+_PIECE = 1 << 16  # bytes that are passed to the parser at a time
+_MOST_PIPELINED = 100  # requests of one connection that wait for the answer to an earlier one
+_SMALL_REST = 1 << 16  # bytes of an unread body up to which the connection is kept
+_LINGER_SECONDS = 2.0  # after the end of a connection, for a client that still sends or has not read everything
 _LINGER_BYTES = 32 << 20
 _SPARE_SECONDS = 1.0  # for the head of a request, when there are too many connections
-_STOP_SECONDS = 3.0  # for requests under way, when the process is to end
+_STOP_SECONDS = 3.0  # for requests in progress at shutdown
 
-# Of the library that reads web sockets.
+# Limits of the websockets library.
 _WEBSOCKET_LINE = 8000
 _WEBSOCKET_FIELDS = 120
 
 
 class GatheringTransport:
-    """A transport that writes what it gets within one turn of the loop at the end of that turn, in one system call.
+    """A transport that collects all writes of one iteration of the event loop and makes one system call at its end.
 
-    The server hands over the head of an answer and its body apart, and uvloop would write each at once. A write that
-    wakes the client takes long; those at the end of a turn, of the answers to all that was ready in it, mostly find it
-    awake.
+    The server writes the head and the body of an answer separately, and uvloop would send each at once. A write that
+    wakes the client is slow. At the end of an iteration, which answers all requests that were ready, the client is
+    mostly awake already.
 
     Parameters
     ----------
     transport : asyncio.Transport
-        Does all that is not written here.
+        The wrapped transport, which does everything else.
     loop : asyncio.AbstractEventLoop
 
     Attributes
     ----------
     lingers : bool
-        Whether the client still sends. To close then would take the answer from it that it has not read: this side
-        ends, and what comes is thrown away for a moment.
+        Whether the client is still sending. Closing the socket then could discard an answer that the client has not
+        read yet: instead, this side of the connection is shut down, and incoming data are discarded for a short time.
     is_lingering : bool
-        Whether that moment is now.
+        Whether this is in progress.
     """
 
     def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> None:
@@ -67,7 +67,7 @@ class GatheringTransport:
         return getattr(self._transport, name)
 
     def write(self, data: bytes) -> None:
-        """Write a piece at the end of the turn, or at once where much is held."""
+        """Buffer data until the end of the iteration; flush at once if the buffer is large."""
         if not self._held:
             self._loop.call_soon(self._flush)
         self._held.append(data)
@@ -81,7 +81,7 @@ class GatheringTransport:
             self.write(piece)
 
     def write_eof(self) -> None:
-        """Write all, and end this side of the connection."""
+        """Flush, and shut down this side of the connection."""
         self._flush()
         self._transport.write_eof()
 
@@ -90,7 +90,7 @@ class GatheringTransport:
         return self.is_lingering or self._transport.is_closing()
 
     def close(self) -> None:
-        """Write all, and close the connection; cut it when the client does not do its part within some seconds."""
+        """Flush and close the connection; abort it if the client has not closed its side within a few seconds."""
         self._flush()
         if self.is_lingering or self._transport.is_closing():
             self._transport.close()
@@ -121,7 +121,7 @@ class GatheringProtocol(HttpToolsProtocol):
     Parameters
     ----------
     *arguments, **options
-        Of uvicorn's protocol.
+        Passed to uvicorn's protocol.
     crowd : Crowd, optional
         The connections of this process.
     """
@@ -133,14 +133,14 @@ class GatheringProtocol(HttpToolsProtocol):
         self._crowd = crowd or Crowd(ConnectionLimits())
         self._limits = self._crowd.limits
         self._is_spare = False
-        self._in_head = False  # some of a head has come, and not all
-        self._in_body = False  # the head has come, and not all of the body
-        self._is_gone = False  # closed, or a web socket now
-        self._fed = 0  # bytes of the head in former pieces
-        self._piece = 0  # bytes of the piece that is parsed
-        self._began = False  # whether a head began in the piece
-        self._heard = False  # whether the piece had some of a body
-        self._unheard = 0  # bytes since then: chunk extensions, trailers
+        self._in_head = False  # a head is partly received
+        self._in_body = False  # the head is received, the body not completely
+        self._is_gone = False  # closed, or upgraded to a web socket
+        self._fed = 0  # bytes of the head in earlier pieces
+        self._piece = 0  # bytes of the piece being parsed
+        self._began = False  # whether a head began in this piece
+        self._has_body = False  # whether this piece had a part of a body
+        self._bytes_since_body = 0  # bytes since then: chunk extensions, trailers
         self._lingered = 0
         self._refusal: tuple[int, Closed, str] | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -164,12 +164,12 @@ class GatheringProtocol(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def drop(self) -> None:
-        """Close the connection at once, for another."""
+        """Close the connection at once to make room for another."""
         self._note("full")
         self.transport.abort()
 
     def shutdown(self) -> None:
-        """End the connection once the request under way is answered; a client that keeps it waiting gets less time."""
+        """End the connection after the answer to the current request; slow clients get less time than usual."""
         super().shutdown()
         if self._in_body and not self.transport.is_closing():
             self._time("body", min(_STOP_SECONDS, self._limits.body_seconds))
@@ -177,10 +177,10 @@ class GatheringProtocol(HttpToolsProtocol):
             self._write_timer.cancel()
             self._write_timer = self.loop.call_later(min(_STOP_SECONDS, self._limits.unread_seconds), self._unread)
 
-    # --- what comes
+    # --- incoming data
 
     def data_received(self, data: bytes) -> None:
-        """Parse what has come, in pieces of which none takes long."""
+        """Parse incoming data in small pieces."""
         if self.transport.is_lingering:
             self._lingered += len(data)
             if self._lingered > _LINGER_BYTES:
@@ -195,7 +195,7 @@ class GatheringProtocol(HttpToolsProtocol):
                 return
 
     def _feed(self, data: bytes) -> None:
-        self._piece, self._heard, self._began = len(data), False, False
+        self._piece, self._has_body, self._began = len(data), False, False
         was_in_body = self._in_body
         super().data_received(data)
         if self._is_gone:
@@ -210,15 +210,15 @@ class GatheringProtocol(HttpToolsProtocol):
                     return
             if self._timed != "head":
                 self._time("head", self._limits.head_seconds)
-        elif self._is_answering():  # nearly always: all of a request has come
+        elif self._is_answering():  # nearly always: a request is complete
             if self._timer is not None:
                 self._untime()
         elif self._timed != "head" and self.timeout_keep_alive_task is None:  # line ends before a request
             self._time("head", self._limits.head_seconds)
 
     def _after_piece_of_body(self, was_in_body: bool) -> None:
-        self._unheard = 0 if self._heard else self._unheard + self._piece
-        if was_in_body and self._unheard > self._limits.head_bytes:
+        self._bytes_since_body = 0 if self._has_body else self._bytes_since_body + self._piece
+        if was_in_body and self._bytes_since_body > self._limits.head_bytes:
             self._refuse(431, "head_too_large", self._too_large())
             return
         if self._timed == "body":
@@ -233,7 +233,7 @@ class GatheringProtocol(HttpToolsProtocol):
         return bool(lengths) and lengths[0].isdigit() and int(lengths[0]) <= _SMALL_REST
 
     def _close_after_early_answer(self) -> None:
-        """Announce in an answer before the end of the body that the connection ends, and end it."""
+        """End the connection if the answer precedes the end of the body; the answer announces it."""
         cycle, send = self.cycle, self.cycle.send
 
         async def send_and_close(message: Any) -> None:
@@ -243,7 +243,7 @@ class GatheringProtocol(HttpToolsProtocol):
 
         cycle.send = send_and_close  # type: ignore[method-assign]
 
-    # --- of the parser
+    # --- parser callbacks
 
     def on_message_begin(self) -> None:
         """Begin a request."""
@@ -267,11 +267,11 @@ class GatheringProtocol(HttpToolsProtocol):
         self._crowd.work(self)
         super().on_headers_complete()
         if not self.parser.should_upgrade():
-            self.headers = []  # fields after the body, which nobody asks for, are no part of the request
+            self.headers = []  # trailer fields are not part of the request
 
     def on_body(self, body: bytes) -> None:
-        """Take a piece of a body."""
-        self._heard = True
+        """Receive a piece of a body."""
+        self._has_body = True
         super().on_body(body)
 
     def on_message_complete(self) -> None:
@@ -288,7 +288,7 @@ class GatheringProtocol(HttpToolsProtocol):
             self._crowd.wait(self)
 
     def handle_websocket_upgrade(self) -> None:
-        """Become a web socket."""
+        """Upgrade to a web socket."""
         if self._is_spare:
             self._refuse(503, None, "there are too many connections; try again later")
             return
@@ -309,13 +309,13 @@ class GatheringProtocol(HttpToolsProtocol):
     # --- refusals
 
     def send_400_response(self, msg: str) -> None:
-        """Answer a request that this service does not accept."""
+        """Answer a malformed or oversized request."""
         status, reason, text = self._refusal or (400, "malformed", msg)
         self._refusal = None
         self._refuse(status, reason, text)
 
     def _refuse(self, status: int, reason: Closed | None, text: str) -> None:
-        """Answer without the application, and close the connection."""
+        """Answer without calling the application, and close the connection."""
         if reason is not None:
             self._note(reason)
         under_way = self._is_answering()
@@ -338,7 +338,7 @@ class GatheringProtocol(HttpToolsProtocol):
             f"{self._limits.head_fields} fields; send less"
         )
 
-    # --- time
+    # --- timeouts
 
     def _time(self, what: str, seconds: float) -> None:
         if self._timer is not None:
@@ -355,7 +355,7 @@ class GatheringProtocol(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         if self.flow.read_paused or (what == "head" and self._is_answering()):
-            # The delay is not the client's.
+            # The client is not the cause of the delay.
             self._time(what, seconds)
         elif what == "body":
             self._refuse(408, "body_too_slow", f"the body did not come within {seconds:g} s")
@@ -366,13 +366,13 @@ class GatheringProtocol(HttpToolsProtocol):
             self.transport.close()
 
     def pause_writing(self) -> None:
-        """Wait for the client to read, for a while."""
+        """Wait for a limited time until the client reads."""
         super().pause_writing()
         if self._write_timer is None:
             self._write_timer = self.loop.call_later(self._limits.unread_seconds, self._unread)
 
     def resume_writing(self) -> None:
-        """Go on, as the client has read."""
+        """Continue, because the client has read."""
         super().resume_writing()
         if self._write_timer is not None:
             self._write_timer.cancel()
@@ -384,7 +384,7 @@ class GatheringProtocol(HttpToolsProtocol):
         self.transport.abort()
 
     def _let_go(self) -> None:
-        """Leave the connection to others."""
+        """Hand the connection over to another protocol."""
         self._is_gone = True
         self._crowd.leave(self)
         self._untime()
@@ -397,10 +397,10 @@ class GatheringProtocol(HttpToolsProtocol):
 
 
 class SocketProtocol(WebSocketsSansIOProtocol):
-    """Web sockets, whose handshakes are refused without a traceback where they are none."""
+    """Web sockets; an invalid handshake is refused without a traceback."""
 
     def handle_parser_exception(self) -> None:
-        """End a connection whose data are no valid frames."""
+        """Close a connection after data that are not valid frames."""
         if self.conn.close_sent is None:  # within the handshake
             self.transport.write(b"HTTP/1.1 400 Bad Request\r\nconnection: close\r\ncontent-length: 0\r\n\r\n")
             self.transport.close()
@@ -409,7 +409,7 @@ class SocketProtocol(WebSocketsSansIOProtocol):
 
 
 class _OnlyAlive:
-    """Answers ``/livez`` and nothing else, as there are too many connections."""
+    """Answers only ``/livez``, because there are too many connections."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

@@ -36,20 +36,20 @@ from rayfix_service.web.assets import viewer_is_built
 from rayfix_tables.errors import RayfixError
 
 _MESSAGES = 2  # times as long as a report may be, a message is answered that it is too long; then the connection ends
-_FIGURES_BYTES = 8 << 20  # of some workers
+_FIGURES_BYTES = 8 << 20  # for the metrics of some workers
 _OTHER_FILES = 150  # that a worker may have open besides its connections: tables, libraries, pipes, a few spare ones
-_SHUTDOWN_SECONDS = 10  # for requests under way; a full batch takes about one
-_ARRIVING_SECONDS = 0.2  # for requests that are on the way to this process when it is to end
+_SHUTDOWN_SECONDS = 10  # for requests in progress; a full batch takes about one
+_ARRIVING_SECONDS = 0.2  # for requests that are still arriving at shutdown
 
 _TRACKS = (
     "track is set with {} workers, among which a target's reports would be split; follow targets with one worker, or "
     "with one on each of several ports, balanced by target_id (docs/tracking.md)"
 )
 
-_NO_VIEWER = "this installation is without the viewer; / says how to get it, and /docs is a page without scripts"
+_NO_VIEWER = "this installation has no viewer; / explains how to get it, and /docs is a page without scripts"
 
 _FEW_FILES = (
-    "a worker takes %d connections instead of %d, as it may not open more files; raise its limit (ulimit -n) "
+    "a worker accepts %d connections instead of %d, because it may not open more files; raise its limit (ulimit -n) "
     "or give fewer --connections"
 )
 
@@ -66,7 +66,7 @@ def serve(
     access_log: bool = False,
     settings: ServiceSettings | None = None,
 ) -> None:
-    """Serve tables until the process gets SIGINT or SIGTERM; requests under way are finished.
+    """Serve tables until the process receives SIGINT or SIGTERM; requests in progress are finished.
 
     Parameters
     ----------
@@ -75,20 +75,20 @@ def serve(
     host : str
         Name or address to listen on; ``0.0.0.0`` is every IPv4 interface.
     port : int
-        TCP port; 0 takes a free one, which the log names.
+        TCP port; 0 chooses a free one and logs it.
     workers : int
-        Processes that listen on the same port and, since they are forked once the tables are loaded, have most of their
-        memory in common.
+        Processes that listen on the same port. They are forked after the tables are loaded and share most of their
+        memory.
     log_format : {"text", "json"}
-        JSON is an object a line.
+        JSON has one object per line.
     access_log : bool
-        Whether to log a line per request, which is many with a hundred targets at 5 Hz.
+        Whether to log one line per request; a hundred targets at 5 Hz make 500 lines per second.
     settings : ServiceSettings, optional
 
     Raises
     ------
     TableError
-        When no table is whole: missing, of another format, or damaged. Where others are whole, these are served.
+        When no table can be used: missing, of another format, or damaged. If some can be used, these are served.
     ServiceError
         When no worker can start, the port is taken, an argument is out of range, the keys are missing, the folder for
         figures cannot be written to, or several workers are to follow targets.
@@ -129,15 +129,15 @@ def serve(
             ws=SocketProtocol,
             ws_max_size=_MESSAGES * settings.body_limits.report,
             timeout_keep_alive=cast("int", limits.idle_seconds),
-            ws_per_message_deflate=False,  # costs more than it saves, on messages of a kilobyte
+            ws_per_message_deflate=False,  # costs more than it saves for messages of a kilobyte
             timeout_graceful_shutdown=_SHUTDOWN_SECONDS,
             server_header=False,
-            access_log=False,  # this package has one of its own
+            access_log=False,  # this package has its own
             log_config=log_config(log_format, access_log=access_log),
         )
         if limits != settings.connection_limits:
             _log.warning(_FEW_FILES, limits.connections, settings.connection_limits.connections)
-        at_hand.update(load_tables(path, checks=checks))  # with logging as configured: kernels may be compiled
+        at_hand.update(load_tables(path, checks=checks))  # after logging is configured: compiling kernels logs messages
         if not viewer_is_built():
             _log.warning(_NO_VIEWER)
         if settings.mqtt is not None:
@@ -150,21 +150,21 @@ def serve(
                 _run(config)
             return
         gc.collect()
-        gc.freeze()  # a collection would write to the common memory of the workers, and so copy it
+        gc.freeze()  # a collection would write to the workers' shared memory and thus copy it
         stack.callback(gc.unfreeze)
         with config.bind_socket() as bound:
             run_workers(
                 partial(_work, config, bound),
                 count=workers,
                 meanwhile=partial(follow_changes, at_hand, path, checks, failed=set()),
-                ending=bound.close,  # or the system would take connections that nobody answers
+                ending=bound.close,  # otherwise the system would accept connections that no process answers
             )
 
 
 def fitting(limits: ConnectionLimits) -> ConnectionLimits:
-    """Let this process open as many files as its connections need, and return the limits that it then can keep.
+    """Raise the limit of open files to what the connections need, and return the limits that are possible.
 
-    Where the system's limit is reached, nothing answers: connections that cannot be taken wait.
+    A process at the limit cannot accept connections; these wait without an answer.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = limits.connections + _OTHER_FILES
@@ -178,7 +178,7 @@ def fitting(limits: ConnectionLimits) -> ConnectionLimits:
 
 
 def _work(config: uvicorn.Config, bound: socket.socket) -> None:
-    """Be one of several processes that answer at an address."""
+    """Run one of several processes that serve an address."""
     share_figures()
     try:
         _run(config, bound)
@@ -188,7 +188,7 @@ def _work(config: uvicorn.Config, bound: socket.socket) -> None:
 
 
 def _run(config: uvicorn.Config, *bound: socket.socket) -> None:
-    """Answer requests until the process is to end."""
+    """Answer requests until shutdown."""
     server = _Server(config)
     server.run(list(bound) or None)
     if not server.started:
@@ -196,9 +196,9 @@ def _run(config: uvicorn.Config, *bound: socket.socket) -> None:
 
 
 class _Server(uvicorn.Server):
-    """A server that answers what was sent before the signal to end.
+    """A server that still answers requests that were sent before the signal to end.
 
-    Such a request may wait in a connection that is not yet accepted or read, and uvicorn would close that.
+    Such a request may wait in a connection that is not yet accepted or read, which uvicorn would close.
     """
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -208,14 +208,14 @@ class _Server(uvicorn.Server):
             tell_started()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Take what has arrived, then stop listening and finish what is under way."""
+        """Accept requests that have arrived, then stop listening and finish requests in progress."""
         await asyncio.sleep(_ARRIVING_SECONDS)
         await super().shutdown(sockets)
 
 
 @contextmanager
 def _runtime_folder() -> Iterator[Path]:
-    """Make the common folder of the workers, with a folder for their figures unless the environment names one."""
+    """Create the workers' shared folder, with a folder for their metrics unless the environment names one."""
     with ExitStack() as stack:
         try:
             folder = stack.enter_context(runtime_folder())
@@ -224,7 +224,7 @@ def _runtime_folder() -> Iterator[Path]:
                 f"the workers need a temporary folder and there is none ({error.strerror}); set TMPDIR to one"
             ) from None
         if MULTIPROCESS_VARIABLE not in os.environ:
-            # The worker that is asked answers for all.
+            # Any worker reports the metrics of all.
             (folder / "metrics").mkdir()
             os.environ[MULTIPROCESS_VARIABLE] = str(folder / "metrics")
             stack.callback(os.environ.pop, MULTIPROCESS_VARIABLE)
@@ -232,22 +232,22 @@ def _runtime_folder() -> Iterator[Path]:
 
 
 def _check_room(folder: Path) -> None:
-    """Check that workers can write their figures.
+    """Check that workers can write their metrics.
 
-    They map sparse files there: where there is no room, the first page that lacks ends the process with a signal.
+    They map sparse files there: on a full disk, the first page without space ends the process with a signal.
     """
     try:
         with NamedTemporaryFile(dir=folder, prefix="rayfix-") as file:
             os.posix_fallocate(file.fileno(), 0, _FIGURES_BYTES)
     except OSError as error:
         raise ServiceError(
-            f"{MULTIPROCESS_VARIABLE} is {folder}, where figures cannot be written ({error.strerror}); "
+            f"{MULTIPROCESS_VARIABLE} is {folder}, where metrics cannot be written ({error.strerror}); "
             "make room there or give another folder"
         ) from None
 
 
 def check_address(host: str, port: int) -> None:
-    """Check that a server can listen there.
+    """Check that a server can listen on a host and port.
 
     Raises
     ------
@@ -261,9 +261,9 @@ def check_address(host: str, port: int) -> None:
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
     except (OSError, UnicodeError):
-        raise ServiceError(f"host {host!r} is no address of this machine; try 127.0.0.1 or 0.0.0.0") from None
+        raise ServiceError(f"host {host!r} is not an address of this machine; try 127.0.0.1 or 0.0.0.0") from None
     with socket.socket(family, kind, protocol) as probe:
-        # As the server will do: a port that merely cools down after its last server is free.
+        # As the server does: a port in TIME_WAIT after an earlier server counts as free.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(address)
@@ -277,7 +277,7 @@ def check_address(host: str, port: int) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether only this machine reaches a host's address."""
+    """Whether a host's address can be reached from this machine only."""
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):

@@ -1,4 +1,4 @@
-"""React to the signal to end before the server waits for open streams to end by themselves."""
+"""Callbacks at the signal to end, before the server waits for open streams."""
 
 import asyncio
 import signal
@@ -12,10 +12,10 @@ _DEFAULTS = (signal.SIG_DFL, signal.SIG_IGN, signal.default_int_handler, None)
 
 @contextmanager
 def on_stop_signal(callback: Callable[[], None]) -> Iterator[None]:
-    """Call something in the running loop at SIGINT or SIGTERM, besides what the server does then.
+    """Call a function in the running loop at SIGINT or SIGTERM, in addition to the server's handler.
 
-    A server that handles these signals stops listening and waits for requests under way; a stream of events would
-    go on until that wait is over. Where nothing handles a signal, it stays like that.
+    A server that handles these signals stops listening and waits for requests in progress; a stream of events would
+    continue until that wait times out. A signal without a handler remains without one.
     """
     loop = asyncio.get_running_loop()
     replaced: dict[signal.Signals, Any] = {}
@@ -32,7 +32,7 @@ def on_stop_signal(callback: Callable[[], None]) -> Iterator[None]:
         if callable(handler) and handler not in _DEFAULTS:
             try:
                 signal.signal(number, chained(handler))
-            except ValueError:  # not the main thread, which alone has signals
+            except ValueError:  # not the main thread; only that receives signals
                 break
             replaced[number] = handler
     try:

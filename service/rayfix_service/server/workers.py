@@ -12,12 +12,12 @@ from collections.abc import Callable
 from rayfix_service.http.errors import ServiceError
 
 COULD_NOT_START = 3
-"""Exit status of a worker that could not start, as uvicorn has it; its successor may, after a pause."""
+"""Exit status of a worker that could not start, the same as uvicorn's; it is replaced after a pause."""
 
-_LOOK_SECONDS = 0.5  # between two looks at the workers, and between two beats of each
-_SILENT_LOOKS = 60  # a worker without a beat for so many is replaced; a kernel may keep it silent for some
-_ENDING_SECONDS = 20.0  # then what has not ended is killed; requests under way get less
-_LONGEST_PAUSE_SECONDS = 10.0  # before the next try after workers that could not start
+_LOOK_SECONDS = 0.5  # between two checks of the workers, and between two heartbeats of each
+_SILENT_LOOKS = 60  # checks without a heartbeat, then a worker is replaced; a long kernel can block it for some
+_ENDING_SECONDS = 20.0  # then workers that have not ended are killed; requests in progress get less
+_LONGEST_PAUSE_SECONDS = 10.0  # before the next attempt after workers that could not start
 _SHARED_BYTES = 16
 _FAILURE_BYTES = 2048
 _END = (signal.SIGINT, signal.SIGTERM)
@@ -29,28 +29,28 @@ _log = logging.getLogger(__name__)
 def run_workers(
     work: Callable[[], None], *, count: int, meanwhile: Callable[[], None], ending: Callable[[], object]
 ) -> None:
-    """Run worker processes until this process gets SIGINT or SIGTERM, then end them.
+    """Run worker processes until this process receives SIGINT or SIGTERM, then end them.
 
-    Workers have all that this process has: its memory is theirs until either writes to it. It must have no other
-    thread. They end by themselves when it dies. One that ends is replaced: at once if it had started (see
-    :func:`tell_started`), after a pause that grows if not.
+    Workers are forked: they share the memory of this process until either side writes to it. This process must have no
+    other thread. Workers end when it dies. A worker that ends is replaced: at once if it had started (see
+    :func:`tell_started`), otherwise after a pause that grows.
 
     Parameters
     ----------
     work : callable
-        What a worker does. SIGTERM must end it.
+        The work of a worker. SIGTERM must end it.
     count : int
     meanwhile : callable
-        What this process does at each look at them, twice a second.
+        Called in this process at each check of the workers, twice a second.
     ending : callable
-        Called when it has signalled them to end.
+        Called after the workers have been signalled to end.
 
     Raises
     ------
     ServiceError
         When none of the first workers can start.
     """
-    # Blocked signals stay pending, and reach no worker before it has handlers of its own.
+    # Blocked signals stay pending until a worker has installed its own handlers.
     former = signal.pthread_sigmask(signal.SIG_BLOCK, _END)
     starts = _Starts(count=count)
     workers: list[_Worker] = []
@@ -77,7 +77,7 @@ def run_workers(
 
 
 class _Starts:
-    """Whether workers start, and when the next one may try after some that could not."""
+    """Whether workers start, and when the next attempt is due after failures."""
 
     def __init__(self, *, count: int) -> None:
         self._count = count
@@ -96,7 +96,7 @@ class _Starts:
         Raises
         ------
         ServiceError
-            When as many as there should be could not start, and none ever has.
+            When as many workers as requested could not start, and none has ever started.
         """
         for worker in workers:
             if worker.has_started and not worker.seen_to_start:
@@ -119,17 +119,17 @@ class _Starts:
         self._reason = reason
 
 
-_own: "_Worker | None" = None  # in a worker, itself
+_own: "_Worker | None" = None  # this process's object, in a worker
 
 
 def tell_started() -> None:
-    """Report to the parent process that this one is ready; does nothing in a process that is no worker."""
+    """Report to the parent process that this worker is ready; does nothing in other processes."""
     if _own is not None:
         _own.shared[1] = 1
 
 
 def tell_failure(reason: str) -> None:
-    """Report to the parent process why this one cannot start, before it ends with ``COULD_NOT_START``."""
+    """Report to the parent process why this worker cannot start, before it ends with ``COULD_NOT_START``."""
     if _own is not None:
         text = reason.encode("utf-8", "backslashreplace")[: _FAILURE_BYTES - 1]
         _own.report[: len(text) + 1] = text + b"\0"
@@ -139,9 +139,9 @@ class _Worker:
     """A worker process, as the process that forked it sees it."""
 
     def __init__(self, work: Callable[[], None]) -> None:
-        # Checks are counted and not the time: all processes may be stopped for long together.
+        # Checks are counted instead of time, because all processes may be suspended together.
         memory = memoryview(mmap.mmap(-1, _SHARED_BYTES + _FAILURE_BYTES))
-        self.shared = memory[:_SHARED_BYTES].cast("Q")  # beats, and whether it has started
+        self.shared = memory[:_SHARED_BYTES].cast("Q")  # heartbeats, and whether the worker has started
         self.report = memory[_SHARED_BYTES:]
         self.seen_to_start = False
         self._beats_seen = 0
@@ -151,16 +151,16 @@ class _Worker:
 
     @property
     def has_started(self) -> bool:
-        """Whether it has reported that it is ready."""
+        """Whether the worker has reported that it is ready."""
         return self.shared[1] != 0
 
     @property
     def failure(self) -> str:
-        """Why it could not start, if it has reported that."""
+        """Why the worker could not start, if it has reported that."""
         return bytes(self.report).partition(b"\0")[0].decode("utf-8", "replace")
 
     def is_well(self) -> bool:
-        """Check whether the process runs and beats; otherwise it has ended."""
+        """Whether the process runs and sends heartbeats; if not, it has ended."""
         beats = self.shared[0]
         self._silent_looks = self._silent_looks + 1 if beats == self._beats_seen else 0
         self._beats_seen = beats
@@ -176,7 +176,7 @@ class _Worker:
 
 
 def _live(work: Callable[[], None], own: _Worker, parent: int) -> None:
-    """Be a worker."""
+    """Run in the worker process."""
     global _own
     _own = own
     for number in _END:
@@ -187,7 +187,7 @@ def _live(work: Callable[[], None], own: _Worker, parent: int) -> None:
 
 
 def _beat(beats: memoryview, parent: int) -> None:
-    """Report to the parent process that this one runs; end when there is no parent."""
+    """Send heartbeats to the parent process; end when it is gone."""
     while os.getppid() == parent:
         beats[0] += 1
         time.sleep(_LOOK_SECONDS)

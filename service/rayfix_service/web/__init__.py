@@ -1,1 +1,1 @@
-"""The viewer in the browser, and its routes of the service."""
+"""The browser viewer and its HTTP routes."""

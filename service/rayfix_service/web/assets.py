@@ -1,7 +1,7 @@
-"""The built files of the viewer and of the page of the HTTP interface, as they go over the wire.
+"""The built files of the viewer and of the HTTP interface's page, ready to be sent.
 
-``make viewer`` builds them into ``static/``; a wheel has them. They are small and few, so they are read once and kept,
-compressed as well.
+``make viewer`` builds them into ``static/``, and wheels contain them. They are few and small: they are read once and
+kept in memory, also compressed.
 """
 
 import gzip
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 STATIC = Path(__file__).with_name("static")
-"""Where the built files are."""
+"""Folder of the built files."""
 
 INDEX = "index.html"
 """The viewer's page."""
@@ -31,7 +31,7 @@ CONTENT_SECURITY_POLICY = "; ".join(
         "frame-ancestors 'none'",
     ]
 )
-"""A page runs its own files and talks to its own service, nothing else."""
+"""Content-Security-Policy: a page runs only its own files and connects only to its own service."""
 
 SECURITY_HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY,
@@ -51,10 +51,10 @@ class Asset:
     Attributes
     ----------
     body, compressed : bytes
-        The file, and what gzip makes of it; None where that does not pay.
+        The content, plain and compressed by gzip; None if compression does not pay.
     media_type : str
     cache_control : str
-        Without a time limit where the name contains a hash of the content, as in all subfolders.
+        Files in subfolders have a hash of the content in their names and are cached without a time limit.
     tag : str
         Entity tag.
     """
@@ -67,12 +67,12 @@ class Asset:
 
 
 def viewer_is_built(folder: Path = STATIC) -> bool:
-    """Whether the built files are there."""
+    """Whether the viewer has been built."""
     return (folder / INDEX).is_file()
 
 
 def load_assets(folder: Path = STATIC) -> dict[str, Asset]:
-    """Read the built files, by their path below the folder; none where the viewer is not built."""
+    """Read the built files, by path within the folder; empty if the viewer has not been built."""
     if not viewer_is_built(folder):
         return {}
     return {path.relative_to(folder).as_posix(): _load(path, folder) for path in folder.rglob("*") if path.is_file()}
@@ -82,7 +82,7 @@ def _load(path: Path, folder: Path) -> Asset:
     body = path.read_bytes()
     media_type = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
     if path.suffix == ".js":
-        media_type = "text/javascript"  # whatever the machine's list of types has
+        media_type = "text/javascript"  # regardless of the machine's list of types
     return Asset(
         body=body,
         compressed=gzip.compress(body, 9, mtime=0) if path.suffix in _COMPRESSIBLE else None,

@@ -1,4 +1,4 @@
-"""The JSON of the viewer's routes."""
+"""JSON models of the viewer's routes."""
 
 import math
 from typing import Annotated, Any, Literal
@@ -20,23 +20,23 @@ from rayfix_service.wire.problems import invalid_report
 
 
 class ViewerSettings(BaseModel):
-    """What the service allows the viewer."""
+    """What the viewer may do."""
 
     simulation: bool = Field(description="whether POST /v1/simulations answers")
-    max_reflections: int = Field(description="most reflections of a path in the table")
+    max_reflections: int = Field(description="largest number of reflections of a path in the table")
 
 
 class CellSummary(BaseModel):
     """A cell of the angular grid."""
 
     index: int
-    azimuth_deg: float = Field(description="of its centre, as the zenith")
+    azimuth_deg: float = Field(description="azimuth of its centre")
     zenith_deg: float
     num_components: int
 
 
 class ComponentSummary(BaseModel):
-    """A component after it was conditioned on the direction."""
+    """A component, conditioned on the direction."""
 
     probability: float = Field(description="fraction of the direction's mixture")
     log_weight: float = Field(description="natural logarithm of that fraction")
@@ -52,16 +52,16 @@ class MixtureDocument(BaseModel):
 
     station_id: str
     in_field_of_view: bool
-    level: int = Field(description="level that answers, 0 is the finest")
+    level: int = Field(description="level that is looked up; 0 is the finest")
     window_deg: float = Field(description="window of that level")
     cells: list[CellSummary] = Field(
-        description="one, or those that are summed for noise wider than a window; at most 64"
+        description="cells that are summed; one, unless the noise is wider than a window; at most 64 are listed"
     )
     num_cells: int
-    log_evidence: float | None = Field(description="logarithm of the direction's density; null where no ray comes from")
-    num_components: int = Field(description="of all these cells")
+    log_evidence: float | None = Field(description="logarithm of the direction's density; null if no ray arrives")
+    num_components: int = Field(description="number of components of all these cells")
     components: list[ComponentSummary] = Field(description="the most probable ones")
-    by_reflections: list[float] = Field(description="probability of 0, 1, ... reflections, all components counted")
+    by_reflections: list[float] = Field(description="probability of 0, 1, ... reflections over all components")
 
 
 class LevelCoverage(BaseModel):
@@ -74,15 +74,15 @@ class LevelCoverage(BaseModel):
 
 
 class CoverageDocument(BaseModel):
-    """How far the paths of a station reach."""
+    """What the paths of a station reach."""
 
     station_id: str
-    coverage: list[float] = Field(description="fraction of the free space that at most 0, 1, ... reflections reach")
+    coverage: list[float] = Field(description="fraction of the free space reached with at most 0, 1, ... reflections")
     levels: list[LevelCoverage] = Field(description="finest first")
 
 
 class SimulationRequest(WireModel):
-    """What to simulate: a UE at a position."""
+    """A simulation: a UE at a position."""
 
     model_config = ConfigDict(title="Simulation")
 
@@ -96,12 +96,12 @@ class SimulationRequest(WireModel):
         default=1.0, ge=1e-3, le=90.0, description="a standard deviation, 0.001 to 90 degrees"
     )
     range_stdev_m: float = Field(default=0.5, ge=1e-3, le=1e3, description="a standard deviation, 0.001 to 1000 m")
-    seed: int = Field(default=0, ge=0, le=2**53, description="a number from 0 on that the noise is drawn from")
+    seed: int = Field(default=0, ge=0, le=2**53, description="the seed of the noise, an integer of 0 or more")
     target_id: str = Field(default="simulated", max_length=256, description="a name of at most 256 characters")
 
 
 class PathSummary(BaseModel):
-    """The path that a station was taken to report."""
+    """The path that the simulated station reports."""
 
     station_id: str
     azimuth_deg: float
@@ -111,7 +111,7 @@ class PathSummary(BaseModel):
 
 
 class SimulationDocument(BaseModel):
-    """A simulated report, the fix it gives, and the paths without noise."""
+    """A simulated report, its fix, and the paths without noise."""
 
     report: ReportDocument
     fix: FixDocument
@@ -129,7 +129,7 @@ class GaussianSummary(BaseModel):
 class PosteriorDocument(BaseModel):
     """The whole posterior of a report, for pictures."""
 
-    gaussians: list[GaussianSummary] = Field(description="the most probable ones before they are cut to the free space")
+    gaussians: list[GaussianSummary] = Field(description="the most probable ones, before the cut to the free space")
     num_gaussians: int
     prior_share: float = Field(description="probability that the report does not constrain the position")
     samples: list[Annotated[list[float], Field(min_length=3, max_length=3)]] = Field(
@@ -143,7 +143,7 @@ def parse_simulation(body: bytes) -> SimulationRequest:
     Raises
     ------
     ReportError
-        For what is not JSON or not a simulation; it names every field that is wrong.
+        When the body is not JSON or not a valid simulation; the error names every invalid field.
     """
     data = read_json(body)
     try:
@@ -228,6 +228,6 @@ def posterior_document(posterior: Posterior, samples: Any, *, most: int = 64) ->
 
 
 def point(position: Any) -> dict[str, float]:
-    """Position of shape (3,) as the wire has it, m."""
+    """Convert a position of shape (3,), m, to its JSON model."""
     x, y, z = (float(v) for v in position)
     return {"x": x, "y": y, "z": z}

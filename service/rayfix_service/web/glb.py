@@ -1,10 +1,10 @@
 """The table's scene as binary glTF, without a mesh library.
 
-glTF 2.0, https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. Its y axis points up and the scene frame's z axis
-does, so the file has one root node, named after the site, whose rotation stands the scene upright; the vertices below
-are in the scene frame, moved to its middle, which a second node moves back: so single precision is exact to a fraction
-of a millimetre in sites that lie far from their origin. ``origin_m`` among the asset's extras is where they count from,
-in the scene frame: programs that hold the places of nodes in single precision draw relative to it.
+glTF 2.0, https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. In glTF the y axis points up, in the scene frame
+the z axis. The root node, named after the site, rotates the scene upright. Vertices are relative to the middle of the
+scene, to which a second node translates them. This keeps single precision exact to a fraction of a millimetre in sites
+far from their origin. ``origin_m`` in the asset's extras is that middle in the scene frame: programs that store
+translations of nodes in single precision draw relative to it.
 """
 
 import json
@@ -20,7 +20,7 @@ from rayfix_tables.scene import Scene
 MEDIA_TYPE = "model/gltf-binary"
 
 NO_MATERIAL = "unnamed"
-"""Name of the material of faces that have none."""
+"""Material name for faces without a material."""
 
 _FLOAT, _UNSIGNED_INT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
@@ -40,7 +40,7 @@ _COLOURS = {
     "chipboard": (0.66, 0.56, 0.44),
     "ceiling_board": (0.80, 0.80, 0.78),
 }
-"""Base colours by a part of the material's name, those of ITU-R P.2040."""
+"""Base colours by a part of the material's name; the names are those of ITU-R P.2040."""
 
 _GREY = (0.64, 0.66, 0.69)
 
@@ -52,12 +52,12 @@ def write_glb(scene: Scene, name: str) -> bytes:
     ----------
     scene : Scene
     name : str
-        Of the root node.
+        Name of the root node.
 
     Returns
     -------
     bytes
-        One mesh with a primitive for each material; faces look the same from both sides.
+        One mesh with a primitive for each material; faces are double-sided.
     """
     low, high = scene.vertices.min(axis=0), scene.vertices.max(axis=0)
     middle = np.round(0.5 * (low + high), 3)
@@ -118,7 +118,7 @@ def _container(document: dict[str, Any], arrays: list[NDArray[Any]]) -> bytes:
     """Pack the two chunks; each is padded to four bytes."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    binary = b"".join(array.tobytes() for array in arrays)  # of four-byte numbers: no padding
+    binary = b"".join(array.tobytes() for array in arrays)  # all numbers have four bytes: no padding
     length = 12 + 8 + len(text) + 8 + len(binary)
     return b"".join(
         [

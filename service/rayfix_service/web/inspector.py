@@ -1,4 +1,4 @@
-"""The mixture of one direction, and the reach of reflections: the data of the table inspector."""
+"""Data of the table inspector: the mixture of one direction, and the mass by number of reflections."""
 
 from dataclasses import dataclass
 
@@ -14,32 +14,32 @@ from rayfix_tables.part import StationPart
 
 @dataclass(frozen=True, kw_only=True)
 class DirectionView:
-    """Mixture of a measured direction, as the fusion looks it up.
+    """Mixture that the fusion looks up for a measured direction.
 
     Attributes
     ----------
     in_field_of_view : bool
     level_index : int
-        Level that answers, 0 is the finest.
+        Level that is looked up; 0 is the finest.
     window : float, rad
         Window of that level.
     cells : ndarray of int64, shape (c,)
-        Cells that are summed; mostly one.
+        Cells that are summed; usually one.
     centres : ndarray of shape (c, 2), rad
         Azimuth and zenith of their centres.
     cell_components : ndarray of int64, shape (c,)
         Components of each.
     log_evidence : float
-        Natural logarithm of the density of this direction; -inf where no ray comes from there.
+        Natural logarithm of the density of this direction; -inf if no ray arrives from it.
     probability : ndarray of shape (n,)
-        Fraction of each component, largest first.
+        Fraction of the mixture of each component, largest first.
     position : ndarray of shape (n, 3), m
     position_cov : ndarray of shape (n, 3, 3), m2
     path_length : ndarray of shape (n,), m
     path_length_stdev : ndarray of shape (n,), m
     num_reflections : ndarray of int64, shape (n,)
     by_reflections : ndarray of shape (k,)
-        Probability that the path has 0, 1, ... reflections, all components counted.
+        Probability that the path has 0, 1, ... reflections, over all components.
     """
 
     in_field_of_view: bool
@@ -69,11 +69,11 @@ def view_direction(
     azimuth, zenith : float, rad
         In the scene frame.
     stdev : float, rad
-        Of both angles.
+        Standard deviation of both angles.
     limit : int
-        Components that are returned, the most probable ones.
+        Number of components to return, the most probable first.
     origin : ndarray of shape (3,), m
-        Of the table's frame in the scene's, in which positions are returned.
+        Origin of the table's frame in the scene frame. Positions are returned in the scene frame.
     """
     measured = Direction(azimuth=azimuth, zenith=zenith, cov=np.diag([stdev**2, stdev**2]))
     lookup = look_up(part.levels, measured)
@@ -106,8 +106,8 @@ def view_direction(
 def mass_by_reflections(level: Level) -> NDArray[np.float64]:
     """Fraction of a level's mass by the number of reflections of its components, shape (k,), summing to 1.
 
-    The mass of a cell is the integral of its measure: volume of free space, weighted by how probably a UE there is
-    reported from that direction.
+    The mass of a cell is the integral of its measure: the volume of free space, weighted by the probability that a UE
+    there is reported from that direction.
     """
     counts = np.diff(level.cell_offsets)
     log_mass = np.repeat(level.cell_log_mass, counts) + level.mixture.log_weight

@@ -1,4 +1,4 @@
-"""The page of the HTTP interface where the built one is missing: the OpenAPI document as HTML without a script."""
+"""Fallback page of the HTTP interface when the built page is missing: the OpenAPI document as HTML without scripts."""
 
 import html
 from collections.abc import Iterator, Mapping
@@ -11,14 +11,14 @@ _PAGE = """\
 <meta name="color-scheme" content="light dark">
 <title>rayfix: HTTP interface</title>
 <h1>HTTP interface</h1>
-<p>This installation is without the interactive page. <a href="openapi.json">The OpenAPI document</a> has all of this.
+<p>This installation has no interactive page. <a href="openapi.json">The OpenAPI document</a> has the same content.
 {body}
 </html>
 """
 
 
 def plain_interface(document: Mapping[str, Any]) -> str:
-    """Write the routes and schemas of an OpenAPI document as a page."""
+    """Render the routes and schemas of an OpenAPI document."""
     schemas = document.get("components", {}).get("schemas", {})
     parts = [f"<p>{_text(document['info'].get('description', ''))}"]
     for path, item in document["paths"].items():

@@ -1,4 +1,4 @@
-"""The viewer's page, the page of the HTTP interface, and their files."""
+"""Routes of the viewer's page, the page of the HTTP interface, and their files."""
 
 from functools import cache
 from typing import Any
@@ -22,7 +22,7 @@ _NOT_BUILT = """\
 <meta name="color-scheme" content="light dark">
 <title>rayfix</title>
 <h1>rayfix</h1>
-<p>The service runs, but this installation is without the viewer, as there was no Node.js 20.19 or later when it was
+<p>The service runs, but this installation has no viewer, because there was no Node.js 20.19 or later when it was
 made. With that, run <code>make viewer</code> in the checkout, or install rayfix again, and start the service again.
 <p><a href="docs">The HTTP interface</a>, and <a href="openapi.json">its OpenAPI document</a>
 </html>
@@ -36,21 +36,21 @@ def _assets() -> dict[str, Asset]:
 
 @router.api_route("/", methods=["GET", "HEAD"])
 async def get_viewer(request: Request) -> Response:
-    """Give the viewer's page."""
+    """Return the viewer's page."""
     asset = _assets().get(INDEX)
     return _plain(_NOT_BUILT) if asset is None else _answer(request, asset)
 
 
 @router.api_route("/docs", methods=["GET", "HEAD"])
 async def get_interface(request: Request) -> Response:
-    """Give the page that shows the OpenAPI document."""
+    """Return the page that shows the OpenAPI document."""
     asset = _assets().get(INTERFACE)
     return _plain(plain_interface(request.app.openapi())) if asset is None else _answer(request, asset)
 
 
 @router.api_route("/openapi.json", methods=["GET", "HEAD"])
 async def get_openapi(request: Request, services: ServicesDep) -> Response:
-    """Give the OpenAPI document, with examples of the table that is served and the path that a proxy adds."""
+    """Return the OpenAPI document, with examples for the served table and the path prefix of a proxy."""
     document: dict[str, Any] = request.app.openapi()
     tables = services.tables.at_hand()
     if tables:
@@ -65,13 +65,13 @@ async def get_openapi(request: Request, services: ServicesDep) -> Response:
 
 @router.api_route("/assets/{name:path}", methods=["GET", "HEAD"])
 async def get_viewer_file(request: Request, name: str) -> Response:
-    """Give one of the viewer's files; their names change with their content."""
+    """Return one of the viewer's files; their names change with their content."""
     return _file(request, f"assets/{name}")
 
 
 @router.api_route("/interface/{name:path}", methods=["GET", "HEAD"])
 async def get_interface_file(request: Request, name: str) -> Response:
-    """Give one of the files of the page of the interface, likewise."""
+    """Return one of the files of the HTTP interface's page; their names change with their content."""
     return _file(request, f"interface/{name}")
 
 

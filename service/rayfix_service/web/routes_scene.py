@@ -1,4 +1,4 @@
-"""Routes for the viewer: the scene, and the mixtures of directions."""
+"""Routes of the scene and of the mixtures of directions, for the viewer."""
 
 import math
 from typing import Annotated, Any
@@ -29,7 +29,7 @@ router = APIRouter(prefix="/v1", tags=["viewer"])
 _COMPUTED = problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY, TOO_MANY_REQUESTS, OVERLOADED, FIX_TIMEOUT)
 
 _WIDEST_DEG = 30.0
-"""Largest standard deviation of a direction whose mixture is given: six of it are the whole circle."""
+"""Largest standard deviation of a direction: six standard deviations are a full turn."""
 
 StationId = Annotated[str, Path(max_length=128, description="the identifier of a station of the table")]
 
@@ -41,7 +41,7 @@ StationId = Annotated[str, Path(max_length=128, description="the identifier of a
     responses={200: {"content": {MEDIA_TYPE: {}}}, **problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY)},
 )
 async def get_scene(request: Request, services: ServicesDep, served: TableDep) -> Response:
-    """Give the mesh as binary glTF: metres, y up by the root node's rotation, materials by name."""
+    """Return the mesh as binary glTF: metres, y up by the root node's rotation, materials by name."""
     table = served.locator.table
     tag = f'"{table.table_id[:32]}"'
     headers = {"ETag": tag, "Cache-Control": "no-cache"}
@@ -62,14 +62,14 @@ async def get_mixture(
     services: ServicesDep,
     served: TableDep,
     station_id: StationId,
-    azimuth_deg: Annotated[float, Query(ge=-180, le=360, allow_inf_nan=False, description="in the scene frame")],
-    zenith_deg: Annotated[float, Query(ge=0, le=180, allow_inf_nan=False, description="in the scene frame")],
+    azimuth_deg: Annotated[float, Query(ge=-180, le=360, allow_inf_nan=False, description="azimuth, scene frame")],
+    zenith_deg: Annotated[float, Query(ge=0, le=180, allow_inf_nan=False, description="zenith, scene frame")],
     stdev_deg: Annotated[
         float, Query(ge=1e-3, le=_WIDEST_DEG, allow_inf_nan=False, description="standard deviation of both angles")
     ] = 1.0,
-    limit: Annotated[int, Query(ge=1, le=512, description="components to return")] = 64,
+    limit: Annotated[int, Query(ge=1, le=512, description="number of components to return")] = 64,
 ) -> JSONResponse:
-    """Look a measured direction up as the fusion does: level, cells, and the components conditioned on it.
+    """Return what the fusion looks up for a measured direction: level, cells, and components conditioned on it.
 
     It counts as a report for the rate limit.
     """
@@ -89,14 +89,14 @@ async def get_mixture(
 
 @router.get(
     "/stations/{station_id}/coverage",
-    summary="How far reflections reach",
+    summary="Coverage by number of reflections",
     response_model=CoverageDocument,
     responses=_COMPUTED,
 )
 async def get_coverage(
     request: Request, services: ServicesDep, served: TableDep, station_id: StationId
 ) -> JSONResponse:
-    """Give the fractions of the free space and of each level's mass by the number of reflections.
+    """Return the fractions of the free space and of each level's mass by number of reflections.
 
     It counts as a report for the rate limit.
     """

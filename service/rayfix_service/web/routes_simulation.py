@@ -1,4 +1,4 @@
-"""Routes that make reports and show whole posteriors."""
+"""Routes that simulate reports and return whole posteriors."""
 
 from time import perf_counter
 from typing import Any, Protocol
@@ -47,7 +47,7 @@ SIMULATION_EXAMPLES = {
     "/viewer", summary="What the viewer may do", responses=problem_responses(NOT_FOUND, INVALID_PARAMETER, NOT_READY)
 )
 async def get_viewer_settings(request: Request, services: ServicesDep, served: TableDep) -> ViewerSettings:
-    """Give the viewer's settings: whether it may simulate, and the most reflections of a path."""
+    """Return the viewer's settings: whether it may simulate, and the largest number of reflections of a path."""
     return viewer_settings(served.locator.table, simulation=services.settings.simulation)
 
 
@@ -59,9 +59,9 @@ async def get_viewer_settings(request: Request, services: ServicesDep, served: T
     openapi_extra=request_body(SimulationRequest, SIMULATION_EXAMPLES),
 )
 async def post_simulation(request: Request, services: ServicesDep, served: TableDep, body: ReportBody) -> JSONResponse:
-    """Measure a UE at a position as the table has it, with noise, and locate it.
+    """Simulate the report of a UE at a position from the table, with noise, and locate it.
 
-    The fix goes to who asked alone: neither to the stream of fixes nor into the figures.
+    Only this response has the fix: the stream of fixes and the metrics do not include it.
     """
     if not services.settings.simulation:
         raise ProblemError(
@@ -79,13 +79,13 @@ async def post_simulation(request: Request, services: ServicesDep, served: Table
     openapi_extra=request_body(ReportDocument, REPORT_EXAMPLES),
 )
 async def post_posterior(request: Request, services: ServicesDep, served: TableDep, body: ReportBody) -> JSONResponse:
-    """Give the Gaussians of the posterior and positions drawn from it, for pictures."""
+    """Return the Gaussians of the posterior and positions drawn from it, for pictures."""
     incoming = await services.answerer.read_report(body)
     return JSONResponse(await services.slow_work.locate(_on(served.locator, picture_posterior), incoming.report))
 
 
 class _Work(Protocol[Asked_contra]):
-    """What a route does with a locator."""
+    """The work of a route, given the locator."""
 
     def __call__(self, locator: Locator, asked: Asked_contra, /, *, stop: Stop) -> dict[str, Any]: ...
 

@@ -1,8 +1,8 @@
-"""Reports of a UE at a given position, made from the table alone.
+"""Simulated reports of a UE at a given position, from the table alone.
 
-At the position, each component of a station's finest level has a density; the one with the highest stands for the path
-that the station reports, and E[u | x] of it for what a perfect one would measure. That is as true as the table is: a
-forward solver knows paths exactly, but the service has none.
+The component of a station's finest level with the highest density at the position represents the path that the station
+reports. Its E[u | x] is the noise-free measurement. This is as accurate as the table: only a forward solver finds exact
+paths, and the service has none.
 """
 
 from collections.abc import Sequence
@@ -22,10 +22,10 @@ from rayfix_tables.table import Table
 Kind = Literal["aoa", "pt", "toa", "tdoa"]
 
 _NEAREST = 4096
-"""So many components, whose means are nearest to the position, are considered."""
+"""Number of components that are considered, those with the means nearest to the position."""
 
 _REACH = 5.0
-"""A component from which the position is more standard deviations away than this is left out."""
+"""Components are left out if the position is more than this many standard deviations from the mean."""
 
 _CLOCK_RANGE = 300.0  # m, one microsecond
 
@@ -41,7 +41,7 @@ class SimulatedPath:
     path_length : float, m
     num_reflections : int
     dropped : int
-        Components near the position that were left out because rounding made their covariances singular.
+        Number of components near the position that were left out because rounding made their covariances singular.
     """
 
     station_id: str
@@ -53,7 +53,7 @@ class SimulatedPath:
 
 
 def find_path(part: StationPart, position: NDArray[np.float64]) -> SimulatedPath | None:
-    """Most probable path from a position to a station; None where there is none.
+    """Most probable path from a position to a station; None if there is none.
 
     Parameters
     ----------
@@ -106,25 +106,25 @@ def simulate(
     range_stdev: float,
     rng: np.random.Generator,
 ) -> tuple[list[SimulatedPath], list[dict[str, Any]]]:
-    """Measure one path per station, with noise and the stations' biases.
+    """Simulate the measurement of one path per station, with noise and the stations' biases.
 
     Parameters
     ----------
     position : sequence of 3 floats, m
     kinds : sequence of str
-        What is measured of each path.
+        Kinds of measurements of each path.
     angle_stdev : float, rad
-        Of azimuth and zenith.
+        Standard deviation of azimuth and zenith.
     range_stdev : float, m
-        Of each time of arrival times the speed of light.
+        Standard deviation of each time of arrival times the speed of light.
     rng : numpy.random.Generator
 
     Returns
     -------
     paths : list of SimulatedPath
-        Of the stations that a path reaches.
+        Paths to the stations that have one.
     measurements : list of dict
-        As ``POST /v1/positions`` takes them.
+        In the form of ``POST /v1/positions``.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def simulate(
     x, y, z = point
     if not table.scene.free_space.contains(point):
         raise ReportError(
-            f"position ({x:.2f}, {y:.2f}, {z:.2f}) is in a solid or outside; give one in the free space",
+            f"position ({x:.2f}, {y:.2f}, {z:.2f}) is in a solid or outdoors; give one in the free space",
             path=("position",),
         )
     local = point - table.scene.origin
@@ -149,7 +149,7 @@ def simulate(
     measurements: list[dict[str, Any]] = []
     lengths = []
     for path in paths:
-        # The draws do not depend on the kinds: with equal seeds, reports of different kinds have the same noise.
+        # The draws do not depend on the kinds: with the same seed, reports of different kinds have the same noise.
         noise = rng.standard_normal(3)
         bias = table.parts[path.station_id].station.bias
         lengths.append(path.path_length + bias.range + range_stdev * float(noise[2]))

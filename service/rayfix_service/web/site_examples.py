@@ -1,4 +1,4 @@
-"""Examples of the OpenAPI document for the table that is served, so that each can be tried out as it stands."""
+"""Examples in the OpenAPI document that the served table can answer without changes."""
 
 import copy
 from collections.abc import Mapping
@@ -22,10 +22,10 @@ _TC_METRES = SPEED_OF_LIGHT / (480e3 * 4096)
 
 
 def with_site_examples(document: Mapping[str, Any], table: Table) -> dict[str, Any]:
-    """Put examples of a table's own stations into an OpenAPI document.
+    """Replace the examples of an OpenAPI document by examples with a table's stations.
 
-    Those of the bundled hall stay where the table is of it. An example that a table has too few stations for is left
-    out, and so are all where no station hears any of some places.
+    For the bundled hall, the document is unchanged. Examples that need more stations than the table has are removed.
+    All are removed if none of the sampled positions is audible to a station.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def with_site_examples(document: Mapping[str, Any], table: Table) -> dict[str, A
     """
     if table.site.name == "hall" and table.parts.keys() >= _OF_THE_HALL:
         return dict(document)
-    place, paths = _well_heard(table)
+    place, paths = _audible_position(table)
     changed = copy.deepcopy(dict(document))
     examples = _examples(table, paths) if paths else {}
     if paths:
@@ -54,8 +54,8 @@ def with_site_examples(document: Mapping[str, Any], table: Table) -> dict[str, A
     return changed
 
 
-def _well_heard(table: Table) -> tuple[list[float], list[SimulatedPath]]:
-    """Find a place that many stations hear, and their paths to it, those with the fewest reflections first."""
+def _audible_position(table: Table) -> tuple[list[float], list[SimulatedPath]]:
+    """Find a position that is audible to many stations, and their paths to it, fewest reflections first."""
     space = table.scene.free_space
     voxels = np.argwhere(space.free)
     rng = np.random.default_rng(_SEED)
@@ -76,7 +76,7 @@ def _well_heard(table: Table) -> tuple[list[float], list[SimulatedPath]]:
 
 
 def _examples(table: Table, paths: list[SimulatedPath]) -> dict[str, dict[str, Any]]:
-    """Bodies by path and name; what is measured has no error."""
+    """Request bodies by path and name; measurements have no error."""
     angles = [_angle(path) for path in paths]
     ranges = [
         {"type": "pt", "station_id": path.station_id, "range_m": round(path.path_length, 2), "stdev_m": 0.5}
@@ -130,7 +130,7 @@ def _differences(paths: list[SimulatedPath]) -> list[dict[str, Any]]:
 
 
 def _nrppa(table: Table, paths: list[SimulatedPath]) -> dict[str, Any]:
-    """UL-AoA from geographic north, and UL-RTOA where two TRPs share the unknown clock."""
+    """UL-AoA from geographic north, and UL-RTOA if two TRPs share the unknown clock."""
     items = []
     for n, path in enumerate(paths, start=1):
         azimuth = int(np.rad2deg(path.azimuth - table.site.north) * 10.0) % 3600
@@ -181,7 +181,7 @@ def _silabs(table: Table, paths: list[SimulatedPath]) -> dict[str, Any]:
 
 
 def _lines(table: Table, paths: list[SimulatedPath]) -> str:
-    """Lines of those stations that have the target before them."""
+    """Lines of the stations with the target in front of them."""
     lines = []
     for path in paths:
         azimuth, elevation = _local(table, path)

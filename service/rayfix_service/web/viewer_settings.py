@@ -1,4 +1,4 @@
-"""Data for the viewer and for the page of a report, whether from a service or from a file."""
+"""Data for the viewer, in a service or in the file of ``rayfix view``."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ _SAMPLES = 1500
 
 
 _MAX_REFLECTIONS = 3
-"""Of tables whose site does not give it."""
+"""Value for tables with a site that does not state it."""
 
 
 def viewer_settings(table: Table, *, simulation: bool) -> ViewerSettings:
@@ -26,6 +26,6 @@ def viewer_settings(table: Table, *, simulation: bool) -> ViewerSettings:
 
 
 def picture_posterior(locator: Locator, report: Report, *, stop: Stop = NEVER) -> dict[str, Any]:
-    """Build what :class:`PosteriorDocument` describes; the same report gives the same samples."""
+    """Build what :class:`PosteriorDocument` describes; equal reports have equal samples."""
     posterior = locator.posterior(report, stop=stop)
     return posterior_document(posterior, posterior.sample(_SAMPLES, np.random.default_rng(0), stop=stop))

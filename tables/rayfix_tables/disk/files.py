@@ -1,4 +1,4 @@
-"""A table's file as the system knows it: looked at before it is opened, and never anything but a regular file."""
+"""A table's file in the file system: its type is checked before it is opened; only regular files are."""
 
 import errno
 import os
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rayfix_tables.errors import NotATableError, TableError
 
 FileState = tuple[int, int, int]
-"""What tells one version of a file from the next: inode, size and time of the last change."""
+"""Identifies a version of a file: inode, size and time of the last change."""
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -26,7 +26,7 @@ class OpenFile:
     Attributes
     ----------
     path : Path
-        Under which it was found; another file may have this name by now.
+        Name when it was opened; another file may have this name now.
     descriptor : int
     state : FileState
         When it was opened.
@@ -43,7 +43,7 @@ class OpenFile:
 
     @property
     def unchanged(self) -> bool:
-        """Whether it is still as it was when it was opened."""
+        """Whether it is unchanged since it was opened."""
         return state_of(os.fstat(self.descriptor)) == self.state
 
     def mapped(self) -> NDArray[np.uint8]:
@@ -53,17 +53,17 @@ class OpenFile:
 
 
 def state_of(status: os.stat_result) -> FileState:
-    """Tell this version of a file from others."""
+    """Return the state that identifies this version of a file."""
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def why_not_regular(path: Path) -> str | None:
-    """Say in words what is no regular file; None for one, after symbolic links, and for what is missing.
+    """Describe a path that is not a regular file; None for a regular file, after symbolic links, and a missing one.
 
     Raises
     ------
     OSError
-        When the file cannot be looked at.
+        When the path cannot be examined.
     """
     try:
         mode = path.stat().st_mode
@@ -81,14 +81,14 @@ def why_not_regular(path: Path) -> str | None:
 
 @contextmanager
 def open_table_file(path: Path) -> Iterator[OpenFile]:
-    """Open a file that may be a table. Pipes, sockets and devices are not opened, as that may wait for ever.
+    """Open a file that may be a table. Pipes, sockets and devices are not opened, because that may block.
 
     Raises
     ------
     TableError
-        When there is none, or it may not be read.
+        When it is missing or must not be read.
     NotATableError
-        When it is no regular file, or none of HDF5.
+        When it is not a regular file, or not an HDF5 file.
     """
     descriptor = _open(path)
     try:
@@ -117,7 +117,7 @@ def _open(path: Path) -> int:
 
 
 def has_signature(descriptor: int, size: int) -> bool:
-    """Whether a file says that it is one of HDF5: at its beginning, or after 512 bytes and powers of two of that."""
+    """Whether a file has HDF5's signature: at its beginning, or at 512 bytes times a power of two."""
     place = 0
     while place < size:
         if os.pread(descriptor, len(_SIGNATURE), place) == _SIGNATURE:

@@ -1,8 +1,8 @@
-"""What a table's file holds and where: all that HDF5 is needed for, refused where it is not as rayfix writes it.
+"""The groups, attributes and array offsets of a table's file, read with HDF5 and checked against the format.
 
-Whoever has the layout reads the arrays from the mapped file, without HDF5. The layout is small and can be sent from the
-process that read it (see :mod:`rayfix_tables.checking`) to those that answer from the table: a damaged file can crash
-HDF5 or hold it for ever.
+With the layout, a process reads the arrays from the mapped file, without HDF5. The layout is small: the process that
+reads it (see :mod:`rayfix_tables.checking`) sends it to those that use the table, because a damaged file can make HDF5
+crash or hang.
 """
 
 import errno
@@ -42,7 +42,7 @@ _OF_THE_SYSTEM = frozenset(
         errno.EREMOTEIO, errno.ESTALE, errno.ETIMEDOUT,
     }
 )  # fmt: skip
-"""Errors of disks, networks and rights, which say nothing of what is in the file."""
+"""Errors of disks, networks and permissions, which do not depend on the file's content."""
 
 _STATION = re.compile(r"stations/[^/]+\Z")
 _LEVEL = re.compile(r"stations/[^/]+/levels/(0|[1-9][0-9]{0,3})\Z")
@@ -52,12 +52,12 @@ _OF_LEVELS = {**LEVEL_DATASETS, "log_balance": LOG_BALANCE, "cell_change": CELL_
 
 @dataclass(frozen=True, kw_only=True)
 class StoredArray:
-    """Where a dataset lies in the file.
+    """Location of a dataset in the file.
 
     Attributes
     ----------
     offset : int
-        From the beginning of the file, bytes; 0 where there is nothing.
+        From the beginning of the file, bytes; 0 for an empty dataset.
     shape : tuple of int
     """
 
@@ -79,7 +79,7 @@ class FileLayout:
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> "FileLayout":
-        """Read what :meth:`to_document` wrote."""
+        """Restore a layout from the data of :meth:`to_document`."""
         stored = document["datasets"].items()
         datasets = {path: StoredArray(offset=offset, shape=tuple(shape)) for path, (offset, shape) in stored}
         return cls(attributes=document["attributes"], datasets=datasets)
@@ -91,7 +91,7 @@ class FileLayout:
         if num_bytes == 0:
             return np.zeros(stored.shape, dtype)
         if stored.offset < 0 or stored.offset + num_bytes > mapped.size:
-            raise ValueError(f"{path} is not whole")
+            raise ValueError(f"{path} is incomplete")
         raw = mapped[stored.offset : stored.offset + num_bytes]
         return raw.view(np.ndarray).view(dtype).reshape(stored.shape)
 
@@ -115,29 +115,28 @@ def dataset_kind(path: str) -> tuple[np.dtype[Any], int]:
 
 
 def shown(text: str) -> str:
-    """Text of a file as it can be said in a line."""
+    """Format a text of the file for a one-line message."""
     return text if text.isprintable() and len(text) <= 100 else ascii(text[:100])
 
 
 @contextmanager
 def damage_reported(path: Path) -> Iterator[None]:
-    """Say in one line what the readers make of a damaged file.
+    """Convert the readers' exceptions on a damaged file into one-line errors.
 
-    A byte changed among the file's own administration shows as any of these: HDF5 raises OSError, KeyError or
-    RuntimeError, and the readers check the type of what it reads nevertheless. A TypeError or an AttributeError is a
-    defect of the readers and goes on as such.
+    A changed byte in HDF5's metadata causes any of these: HDF5 raises OSError, KeyError or RuntimeError, or the readers
+    find a wrong type. A TypeError or an AttributeError is a defect of the readers and is not converted.
     """
     try:
         yield
     except MemoryError as error:
-        # What the file says that it holds is bounded by its size, so that the file is not to blame.
+        # The claimed sizes are bounded by the file's size, so the file is not the cause.
         raise TableError(
             f"{path} cannot be read: there is not enough memory for it; free some, or use a larger machine"
         ) from error
     except OSError as error:
         if error.errno in _OF_THE_SYSTEM:
             raise TableError(
-                f"{path} cannot be read ({os.strerror(error.errno)}); see whether its disk is there, then try again"
+                f"{path} cannot be read ({os.strerror(error.errno)}); check that its disk is available, then try again"
             ) from error
         raise _damage(path, error) from error
     except (KeyError, OverflowError, RuntimeError, SystemError, ValueError) as error:
@@ -151,23 +150,23 @@ def _damage(path: Path, error: Exception) -> CorruptTableError:
 def read_layout(opened: OpenFile) -> FileLayout:
     """Read the layout of a file with HDF5. Call it within :func:`damage_reported`.
 
-    Links, filters, chunks, virtual and external storage, members that a table does not have, and shapes that the file
-    has no room for are refused before any of it is read.
+    Links, filters, chunks, virtual and external storage, unknown members, and shapes larger than the file are refused
+    before any data are read.
 
     Raises
     ------
     NotATableError
-        When it is another program's file.
+        When another program wrote it.
     FormatVersionError
         When another version of rayfix wrote it.
     ValueError
-        When it is not as rayfix writes it.
+        When it does not have the structure that rayfix writes.
     """
     path = opened.path
-    # By its descriptor: another file may have its name by now. Without a lock, which some file systems do not have and
-    # another program may hold: a table never changes in place.
+    # Opened by its descriptor, because another file may have its name now. Without a lock, which some file systems lack
+    # and another program may hold; a table never changes in place.
     with h5py.File(f"/dev/fd/{opened.descriptor}", "r", locking=False) as file:
-        # Texts in a heap may keep HDF5 busy for ever, so that files of this version must not have any.
+        # Damaged texts in a heap can make HDF5 hang; files of this version must not have any.
         reader = _Reader(size=opened.size, in_heaps=_whole_number(file, "format_version") != FORMAT_VERSION)
         root = reader.attributes_of(file.id, "")
         if root.get("format") != FORMAT:
@@ -187,12 +186,12 @@ def read_layout(opened: OpenFile) -> FileLayout:
 
 @dataclass(kw_only=True)
 class _Reader:
-    """Reads the objects of a file, as far as the file's size allows.
+    """Reads the objects of a file and refuses sizes that exceed it.
 
     Attributes
     ----------
     size : int
-        Of the file, bytes; what the objects say that they hold must not be more.
+        Size of the file, bytes; an upper limit of the claimed sizes.
     in_heaps : bool
         Whether texts may be of variable length.
     """
@@ -224,13 +223,13 @@ class _Reader:
         most = self.size // _LEAST_OBJECT_BYTES
 
         def visit(name: bytes, info: Any) -> bool | None:
-            # What is raised here, h5py does not report as it is; what is returned ends the search.
+            # h5py does not pass on exceptions of this callback; returning a value ends the visit.
             found.append((name, info.type, info.u))
             return True if len(found) > most else None
 
         group.links.iterate(visit, info=True)
         if len(found) > most:
-            raise ValueError(f"{shown(path or '/')} has more members than the file has room for")
+            raise ValueError(f"{shown(path or '/')} has more members than fit into the file")
         names = []
         for raw, kind, address in found:
             name = raw.decode("utf-8")
@@ -247,9 +246,9 @@ class _Reader:
         dtype, ndim = dataset_kind(path)
         plan, space = dataset.get_create_plist(), dataset.get_space()
         if plan.get_layout() != h5py.h5d.CONTIGUOUS or plan.get_external_count() or plan.get_nfilters():
-            raise ValueError(f"{path} is not stored in one piece, without a filter")
+            raise ValueError(f"{path} is not stored contiguously without a filter")
         if space.get_simple_extent_type() != h5py.h5s.SIMPLE:
-            raise ValueError(f"{path} is no array")
+            raise ValueError(f"{path} is not an array")
         shape = tuple(int(length) for length in space.get_simple_extent_dims())
         if not dataset.get_type().equal(h5py.h5t.py_create(dtype)) or len(shape) != ndim:
             raise ValueError(f"{path} is {_type_of(dataset)} with {len(shape)} axes, not {dtype} with {ndim}")
@@ -257,7 +256,7 @@ class _Reader:
         offset = dataset.get_offset() if num_bytes else 0
         self._array_bytes += num_bytes
         if offset is None or max(*shape, self._array_bytes, offset + num_bytes) > self.size:
-            raise ValueError(f"{path} is not whole")
+            raise ValueError(f"{path} is incomplete")
         self.datasets[path] = StoredArray(offset=offset, shape=shape)
         self.attributes_of(dataset, path)
 
@@ -283,7 +282,7 @@ class _Reader:
         scalar = extent == h5py.h5s.SCALAR
         row = extent == h5py.h5s.SIMPLE and space.get_simple_extent_ndims() == 1
         if not (is_text and scalar) and not (is_number and (scalar or row)):
-            raise ValueError(f"{shown(name)} is no text and no number")
+            raise ValueError(f"{shown(name)} is neither a text nor a number")
         if space.get_simple_extent_npoints() > _LONGEST_ARRAY or kind.get_size() > self.size:
             raise ValueError(f"{shown(name)} is too long")
         if is_text:
@@ -300,7 +299,7 @@ class _Reader:
 
 
 def _whole_number(file: h5py.File, name: str) -> int | None:
-    """Value of an attribute of the file that is one whole number; None where it is anything else."""
+    """Value of an integer attribute of the file; None for any other value."""
     if not h5py.h5a.exists(file.id, name.encode()):
         return None
     attribute = h5py.h5a.open(file.id, name.encode())
@@ -315,7 +314,7 @@ def _type_of(identifier: Any) -> np.dtype[Any]:
     """Type of an attribute or a dataset."""
     try:
         dtype: np.dtype[Any] = identifier.dtype
-    except TypeError as error:  # h5py's own, of types that NumPy does not have
+    except TypeError as error:  # raised by h5py for types that NumPy does not have
         raise ValueError(str(error)) from error
     return dtype
 

@@ -1,8 +1,7 @@
-"""Files and folders that belong to a running process, and are removed by others once it has ended.
+"""Files and folders that belong to a running process; other processes remove them after its end.
 
-A process number does not tell: the first process of each container has the number 1, and containers share volumes. The
-owner holds a lock on its file, which the system takes away when the owner ends, however it ends. Names are never used
-twice.
+Process numbers cannot identify the owner: each container has a process 1, and containers share volumes. Instead the
+owner holds a lock on its file, which the system releases when the owner ends, even by a signal. Names are never reused.
 """
 
 import contextlib
@@ -14,9 +13,9 @@ from pathlib import Path
 
 
 def try_lock(descriptor: int, *, shared: bool = False) -> bool | None:
-    """Lock an open file or folder, if nobody else has; returns whether it did.
+    """Lock an open file or folder if no other process has; returns whether it succeeded.
 
-    Some network file systems have no locks: there it returns None, and nothing is to be taken for abandoned.
+    Returns None on network file systems without locks; nothing on them must be treated as abandoned.
     """
     try:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
@@ -28,7 +27,7 @@ def try_lock(descriptor: int, *, shared: bool = False) -> bool | None:
 
 
 def is_at(descriptor: int, path: Path) -> bool:
-    """Whether an open file is still the one of that name."""
+    """Whether an open file still has that name."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.lstat())
     except OSError:
@@ -36,12 +35,12 @@ def is_at(descriptor: int, path: Path) -> bool:
 
 
 def own_file(folder: Path, prefix: str) -> tuple[Path, int]:
-    """Make a file that is this process's as long as it is open; returns its path and descriptor.
+    """Create a file that this process owns while it is open; returns its path and descriptor.
 
     Raises
     ------
     OSError
-        When it cannot be made.
+        When it cannot be created.
     """
     while True:
         path = folder / f"{prefix}{uuid.uuid4().hex}"
@@ -55,7 +54,7 @@ def own_file(folder: Path, prefix: str) -> tuple[Path, int]:
             with contextlib.suppress(OSError):
                 path.unlink()
             raise
-        os.close(descriptor)  # taken for abandoned before it was locked
+        os.close(descriptor)  # another process removed it as abandoned before it was locked
 
 
 def remove_abandoned(folder: Path, prefix: str) -> None:

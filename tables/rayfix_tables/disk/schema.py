@@ -17,12 +17,12 @@ FORMAT_VERSION = 2
 """Version that is written."""
 
 TEXT_IN_HEAPS = 1
-"""Version whose texts are attributes of variable length, in a heap of the file; it is read, too."""
+"""Older version that is also read: its texts are attributes of variable length, stored in a heap of the file."""
 
 READ_VERSIONS = (TEXT_IN_HEAPS, FORMAT_VERSION)
 
 ARRAYS_VERSION = 1
-"""Version of what a part's arrays say: both versions of the format have the same, so that parts can be taken over."""
+"""Version of the meaning of a part's arrays. It is the same in both format versions, which permits reuse of parts."""
 
 TEXT_DATASETS: dict[str, tuple[type[np.generic], int]] = {"site": (np.uint8, 1), "scene/materials": (np.uint8, 1)}
 """Type and number of axes of the datasets that hold JSON, in UTF-8."""
@@ -67,16 +67,16 @@ def bias_attributes(bias: StationBias) -> dict[str, float]:
 
 
 def read_bias(attributes: Mapping[str, Any]) -> StationBias:
-    """Bias of a station from the attributes of its group; tables without them are of stations without a bias.
+    """Bias of a station from the attributes of its group; zero if they are missing.
 
     Raises
     ------
     ValueError
-        When one of them is no number.
+        When one of them is not a number.
     """
     metres_and_degrees = [attributes.get(name, 0.0) for name in bias_attributes(NO_BIAS)]
     if not all(isinstance(value, int | float) for value in metres_and_degrees):
-        raise ValueError("the bias of a station is no number")
+        raise ValueError("the bias of a station is not a number")
     azimuth, zenith, angle_stdev = (float(angle) for angle in np.deg2rad(metres_and_degrees[2:]))
     return StationBias(
         range=float(metres_and_degrees[0]),
@@ -88,13 +88,13 @@ def read_bias(attributes: Mapping[str, Any]) -> StationBias:
 
 
 def write_text(node: h5py.Group | h5py.Dataset, name: str, text: str) -> None:
-    """Write an attribute that is a text of fixed length: it lies in the object itself and not in a heap."""
+    """Write an attribute as a text of fixed length, which is stored in the object itself and not in a heap."""
     raw = text.encode()
     node.attrs.create(name, raw, dtype=h5py.string_dtype("utf-8", max(1, len(raw))))
 
 
 def read_text(node: h5py.Group | h5py.Dataset, name: str) -> str:
-    """Read an attribute that is a text, of fixed or of variable length."""
+    """Read a text attribute of fixed or variable length."""
     return str(_plain(node.attrs[name]))
 
 
@@ -104,7 +104,7 @@ def read_mounting(attributes: Mapping[str, Any]) -> Mounting:
     for known in get_args(Mounting):
         if mounting == known:
             return cast("Mounting", known)
-    raise ValueError(f"mounting is {mounting!r}; this version knows {', '.join(get_args(Mounting))}")
+    raise ValueError(f"mounting is {mounting!r}; this version supports {', '.join(get_args(Mounting))}")
 
 
 def array_digest(array: NDArray[Any]) -> str:
@@ -116,7 +116,7 @@ def array_digest(array: NDArray[Any]) -> str:
 
 
 def content_id(attributes: Mapping[str, Any], digests: Mapping[str, str]) -> str:
-    """``table_id``: SHA-256 over everything that decides an answer.
+    """``table_id``: SHA-256 of everything that influences an answer.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def content_id(attributes: Mapping[str, Any], digests: Mapping[str, str]) -> str
 
 
 def content_attributes(file: h5py.File) -> dict[str, Any]:
-    """Gather the attributes that belong to the content, by path; not the checksums, nor who wrote it when."""
+    """Collect the attributes that belong to the content, by path; without checksums, author and time of writing."""
     gathered: dict[str, dict[str, Any]] = {"": dict(file.attrs)}
     file.visititems(lambda name, node: gathered.update({name: dict(node.attrs)}))
     return content_of(
@@ -144,7 +144,7 @@ def _plain(value: Any) -> Any:
 
 
 def content_of(attributes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Choose the attributes that belong to the content of those of all objects, by path; the root's is ``""``."""
+    """Select the attributes that belong to the content, by path of their object; the root is ``""``."""
     found = {
         f"{path}@{key}": value
         for path, each in attributes.items()

@@ -1,4 +1,4 @@
-"""Values that the kernels rely on: numbers that are finite, and indices of what is there."""
+"""Checks of values that the kernels rely on: finite numbers, and indices within range."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 _AT_A_TIME = 1 << 20
-"""Numbers that are looked at together, so that no copy is as large as the table."""
+"""Numbers that are checked at a time, to keep temporary copies small."""
 
 
 def check_finite(arrays: Iterable[tuple[str, NDArray[Any]]]) -> None:
-    """Check that no array has a number that is not finite; a cell's mass of zero has a logarithm of -inf.
+    """Check that all numbers are finite, except logarithms of a cell's mass, which may be -inf.
 
     Raises
     ------
@@ -42,12 +42,12 @@ def check_range(name: str, array: NDArray[Any], least: int, most: int) -> None:
 
 
 def check_rings(name: str, ring_cells: NDArray[np.int64], num_cells: int) -> None:
-    """Check that the rings of a grid have cells, and no more than these.
+    """Check that each ring of a grid has at least one cell and at most this many.
 
     Raises
     ------
     ValueError
-        When they have not; the message names the array.
+        When this does not hold; the message names the array.
     """
     if not len(ring_cells):
         raise ValueError(f"{name} has no ring")
@@ -63,5 +63,5 @@ def check_offsets(name: str, offsets: NDArray[np.int64], count: int) -> None:
         When they do not; the message names the array.
     """
     ends = len(offsets) > 0 and int(offsets[0]) == 0 and int(offsets[-1]) == count
-    if not ends or np.any(offsets[1:] < offsets[:-1]):  # differences of what is damaged may overflow
+    if not ends or np.any(offsets[1:] < offsets[:-1]):  # differences of damaged offsets may overflow
         raise ValueError(f"{name} do not run from 0 to {count}")

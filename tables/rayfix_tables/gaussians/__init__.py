@@ -1,1 +1,1 @@
-"""Operations on Gaussians that the offline job and the service have in common."""
+"""Operations on Gaussians for the offline job and the service."""

@@ -1,7 +1,7 @@
-"""Says on the log when kernels of rayfix are compiled.
+"""Log messages while kernels of rayfix are compiled.
 
-numba compiles a kernel when it is first called and says nothing of it. After an installation that takes a minute, on a
-busy machine several. What is on disk already is loaded and not announced.
+numba compiles a kernel silently at its first call. After an installation that takes a minute, on a busy machine several
+minutes. Kernels loaded from the cache on disk are not announced.
 """
 
 import logging
@@ -16,7 +16,7 @@ _log = logging.getLogger("rayfix")
 
 
 class _Announcer(event.Listener):  # type: ignore[misc]
-    """Follows compilations, one at a time: numba holds a lock during each."""
+    """Tracks compilations, one at a time, because numba holds a lock during each."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -24,7 +24,7 @@ class _Announcer(event.Listener):  # type: ignore[misc]
         self._last: float | None = None
 
     def on_start(self, event: event.Event) -> None:
-        """Announce the first compilation; kernels that a kernel calls are compiled within it."""
+        """Announce the first compilation; the compilation of a kernel includes those of the kernels that it calls."""
         if not _is_own(event):
             return
         if self._last is None:
@@ -32,7 +32,7 @@ class _Announcer(event.Listener):  # type: ignore[misc]
             _log.warning("compiling kernels, once; this takes a minute or two and longer on a busy machine")
 
     def on_end(self, event: event.Event) -> None:
-        """Count, and from time to time tell the number."""
+        """Count compilations, and log the number at intervals."""
         if not _is_own(event) or self._last is None:
             return
         self._count += 1
@@ -53,7 +53,7 @@ _registered = False
 
 
 def announce_compilation() -> None:
-    """Have compilations of rayfix's kernels announced from now on."""
+    """Announce compilations of rayfix's kernels from now on."""
     global _registered
     if not _registered:
         _registered = True

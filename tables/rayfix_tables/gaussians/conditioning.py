@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 class MeasuredCells(NamedTuple):
-    """Cells of a level, and what is left of a measured angle beside the window of each.
+    """Cells of a level, and the rest of a measured angle after removal of each cell's window.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ def condition_on_angle(tubes: Any, cells: Any, out: Any) -> None:
                 k2 = column1[i] * i12 + column2[i] * i22
                 for j in range(3):
                     cov[i, j] = prior[i][j] - k1 * column1[j] - k2 * column2[j]
-            # The tube widens: at the new mean its direction differs, and its slopes are those of another length.
+            # The widening: at the new mean, the tube's direction differs, and its slopes belong to another length.
             length = np.float64(u_mean[k, 0])
             stretch = 1.0 + u[0] / length
             for i in range(3):

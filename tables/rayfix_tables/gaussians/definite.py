@@ -1,7 +1,7 @@
 """Covariances that are positive definite.
 
-Whoever makes a covariance guarantees that it is positive definite, or drops the component together with its weight and
-counts it. Whoever uses one relies on that.
+Code that makes a covariance guarantees that it is positive definite; otherwise it drops the component with its weight
+and counts it. Code that uses a covariance relies on that.
 """
 
 import numpy as np
@@ -67,10 +67,10 @@ def is_definite(cov: Array) -> NDArray[np.bool_]:
 
 
 def rounded_definite(cov: Array) -> Array:
-    """Round covariances to single precision so that those that are positive definite remain so.
+    """Round covariances to single precision; those that are positive definite remain positive definite.
 
-    Rounding can make a covariance of a large condition number singular. The variances of such a one are raised by a few
-    units of the last place, relative to each of them.
+    Rounding can make a covariance with a large condition number singular. Its variances are then raised by a few units
+    in the last place.
 
     Parameters
     ----------

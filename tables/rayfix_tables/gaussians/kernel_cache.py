@@ -1,12 +1,11 @@
-"""Where compiled kernels are kept when numba finds no folder that it can write to.
+"""The folder of compiled kernels when numba finds none that it can write to.
 
-numba compiles a kernel once and keeps it beside its module, or else in the user's cache folder; ``NUMBA_CACHE_DIR``
-names another one. Where it can write to none of them, as in a read-only container without a home, importing a module
-with kernels fails: numba's decorator looks for the folder when it is applied. So this cannot wait for a first call, and
-the three packages with kernels call :func:`ensure_kernel_cache` in their ``__init__``, which Python runs before any of
-their modules, whichever is imported first. ``rayfix_tables`` does not: whoever only reads a table needs no folder.
-Nothing else runs when a package is imported. This is the only module that changes the process's environment for it, so
-that worker processes take the same folder.
+numba compiles a kernel once and caches it next to its module or in the user's cache folder; ``NUMBA_CACHE_DIR`` names
+another one. If it can write to none of them, as in a read-only container without a home, importing a module with
+kernels fails, because numba's decorator looks for the folder. The three packages with kernels therefore call
+:func:`ensure_kernel_cache` in their ``__init__``, which Python runs before any of their modules. ``rayfix_tables`` does
+not, because reading a table needs no folder. Nothing else runs when a package is imported. This is the only module that
+changes the process's environment; worker processes inherit the folder.
 """
 
 import logging
@@ -25,7 +24,7 @@ _log = logging.getLogger("rayfix")
 
 
 def ensure_kernel_cache(package: Path) -> None:
-    """Let numba keep kernels in a private temporary folder if it can write nowhere else.
+    """Let numba cache kernels in a private temporary folder if it can write nowhere else.
 
     Parameters
     ----------
@@ -35,7 +34,7 @@ def ensure_kernel_cache(package: Path) -> None:
     Raises
     ------
     RayfixError
-        When no temporary folder can be written to either.
+        When no temporary folder is writable either.
     """
     given = os.environ.get(VARIABLE)
     if any(
@@ -45,7 +44,7 @@ def ensure_kernel_cache(package: Path) -> None:
     folder = _temporary_folder()
     os.environ[VARIABLE] = str(folder)
     if "numba" in sys.modules:
-        # It read the environment when it was imported.
+        # numba read the environment at its import.
         sys.modules["numba"].config.CACHE_DIR = str(folder)
     _log.warning(
         "compiled kernels go to %s, as neither %s nor the user's cache folder can be written to; "
@@ -57,7 +56,7 @@ def ensure_kernel_cache(package: Path) -> None:
 
 
 def _is_writable(folder: Path) -> bool:
-    """Whether numba could keep kernels in a folder: it makes the folder and a file in it, and so does this."""
+    """Whether numba could cache kernels in a folder: like numba, this creates the folder and a file in it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
@@ -67,7 +66,7 @@ def _is_writable(folder: Path) -> bool:
 
 
 def _user_cache() -> Path | None:
-    """Folder that numba takes of the user's; None without a home, for which numba takes one called ``~``."""
+    """Return numba's user cache folder; None without a home, where numba would use a folder called ``~``."""
     if sys.platform == "darwin":
         folder = Path(os.path.expanduser("~/Library/Caches"))
     else:
@@ -76,7 +75,7 @@ def _user_cache() -> Path | None:
 
 
 def _temporary_folder() -> Path:
-    """Make a folder that only this user can read and write: what is in it is run."""
+    """Create a folder that only this user can read and write, because its content is executed."""
     tried = []
     for parent in _temporary_parents():
         try:
@@ -90,19 +89,19 @@ def _temporary_folder() -> Path:
 
 
 def _temporary_parents() -> Iterator[Path]:
-    # Not tempfile.gettempdir(), which takes the current folder when all else fails.
+    # tempfile.gettempdir() would fall back to the current folder.
     named = [os.environ[name] for name in ("TMPDIR", "TEMP", "TMP") if os.environ.get(name)]
     yield from map(Path, dict.fromkeys((*named, "/tmp", "/var/tmp", "/dev/shm")))
 
 
 def _private_folder(parent: Path) -> Path:
-    """Folder of this user, the same one each time unless another user has taken its name."""
+    """Folder of this user, the same at each call unless another user has taken its name."""
     folder = parent / f"rayfix-kernels-{os.geteuid()}"
     try:
         folder.mkdir(mode=0o700)
     except FileExistsError:
         found = folder.lstat()
-        # Whoever else could write there could have this process run anything.
+        # Another user who could write there could make this process run any code.
         mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077
         if not mine:
             folder = Path(tempfile.mkdtemp(prefix="rayfix-kernels-", dir=parent))

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SQUARES = (2.0, 3.0, 7.0)
-"""The points of :func:`normal_points` are multiples of the roots of these."""
+"""The points of :func:`normal_points` are multiples of the square roots of these primes."""
 
 
 @cache
@@ -31,12 +31,12 @@ def unit_points(count: int = 128) -> NDArray[np.float64]:
 
 @cache
 def normal_points(count: int) -> NDArray[np.float64]:
-    """Quasi-random points of a standard normal in three dimensions, shape (count, 3); so is any run of them.
+    """Quasi-random points of a standard normal in three dimensions, shape (count, 3); any consecutive part is one too.
 
     Quantiles of multiples of irrational numbers, which fill the unit cube more uniformly than random numbers
     (R. D. Richtmyer, "The evaluation of definite integrals, and a quasi-Monte-Carlo method based on the properties of
     algebraic numbers", 1951).
-    With 1,024 points the radius of the sphere that contains 50 to 99 % of them is exact to 0.5 %.
+    With 1,024 points, the radii of the spheres that contain 50 to 99 % of them are exact to 0.5 %.
     """
     uniform = (0.5 + np.arange(1, count + 1)[:, None] * np.sqrt(SQUARES)) % 1.0
     quantile = NormalDist().inv_cdf

@@ -1,14 +1,14 @@
 """Mixture reduction by a tree, for thousands of components.
 
-The tree is made by halving the bounding box of the means along its longest side, again and again. From the leaves up,
+The tree is made by repeatedly halving the bounding box of the means along its longest side. From the leaves up,
 the two halves of a node are merged into one component if that raises the divergence by no more than a limit (the bound
 of A. R. Runnalls, "Kullback-Leibler approach to Gaussian mixture reduction", IEEE Trans. Aerosp.
 Electron. Syst. 43 (3), 2007: ``((w_i + w_j) log|P_ij| - w_i log|P_i| - w_j log|P_j|) / 2`` for components i and j and
-their union's covariance P_ij). Only neighbours are compared, so that the time grows with the number of components and
-not with that of their pairs.
+their union's covariance P_ij). Only neighbours are compared: the time grows with the number of components, not of
+pairs.
 
-The divergence may be that of the mixture *as it is measured*: noise is added before determinants are computed, so that
-components are merged which no measurement distinguishes.
+The divergence may be that of the mixture *as it is measured*: noise is added before determinants are computed. This
+merges components that no measurement distinguishes.
 """
 
 from typing import Any
@@ -33,7 +33,8 @@ def halve_and_merge(weight: Any, mean: Any, cov: Any, group: Any, scale: Any, no
     group : ndarray of int64, shape (n,)
         Components of different groups are not merged.
     scale : tuple of d floats, or ndarray of shape (d,)
-        Units in which the sides of a box are compared. With a tuple, d is known at compile time: it is twice as fast.
+        Units in which the sides of a box are compared. With a tuple, d is known at compile time, which is twice as
+        fast.
     noise : tuple of d floats, or ndarray of shape (d,)
         Variances of the noise that measurements add.
     max_divergence : float

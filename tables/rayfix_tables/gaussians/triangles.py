@@ -22,7 +22,7 @@ def unpack_upper(packed: Any, n: Any, matrix: Any, first: Any) -> None:
     n : int
         Row.
     matrix : ndarray of shape (d, d)
-        Filled from its row and column ``first`` on; a slice for each matrix would take longer than all else.
+        Filled from its row and column ``first`` on; slicing each matrix would be much slower.
     first : int
     """
     entry = 0
@@ -51,7 +51,7 @@ def pack_lower(matrix: Any, columns: Any, n: Any) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def unpack_lower(columns: Any, n: Any, matrix: Any) -> None:
-    """Undo :func:`pack_lower`: fill a symmetric matrix."""
+    """Unpack a column of :func:`pack_lower` into a symmetric matrix."""
     for i in range(len(matrix)):
         for j in range(i + 1):
             matrix[i, j] = columns[triangle(i) + j, n]

@@ -1,4 +1,4 @@
-"""Angles and directions, in radians; the only place where azimuths are subtracted.
+"""Angles and directions, in radians; the only module that subtracts azimuths.
 
 Conventions are those of docs/conventions.md: ``azimuth`` in (-pi, pi] from +x towards +y, ``zenith`` in [0, pi]
 from +z, both of the direction from the station towards the incoming ray.
@@ -26,7 +26,7 @@ def wrap(angle: ArrayLike) -> Array:
     """
     angle = np.asarray(angle, dtype=np.float64)
     turned = angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
-    # Half a turn is rounded either way; the interval has one end only. Angles within it come back exactly.
+    # Rounding can give -pi or pi for half a turn; only pi is in the interval. Angles in the interval are unchanged.
     low, high = turned <= -np.pi, turned > np.pi
     return cast("Array", turned + 2.0 * np.pi * low - 2.0 * np.pi * high)
 

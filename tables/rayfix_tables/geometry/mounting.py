@@ -1,6 +1,6 @@
 """How an array is mounted: from its boresight and roll to the orientation of its local frame, and back.
 
-The mounted board has a frame of its own: x along its boresight, y to the left of who looks along it, z along its upper
+The mounted board has a frame of its own: x along its boresight, y to the left when looking along it, z along its upper
 edge. Vendors' local frames are this one with its axes named differently. docs/mounting.md draws them.
 """
 
@@ -32,7 +32,7 @@ FRAMES: dict[Mounting, ArrayFrame] = {
 
 
 class Boresight(NamedTuple):
-    """Where an array looks, rad: azimuth in the scene frame, and angle below the horizon."""
+    """Boresight of an array, rad: azimuth in the scene frame, and angle below the horizon."""
 
     azimuth: float
     downtilt: float
@@ -47,8 +47,8 @@ def orientation_of(mounting: Mounting, boresight: Boresight, roll: float) -> tup
         Local frame of the array.
     boresight : Boresight, rad
     roll : float, rad
-        Turn about the boresight, clockwise for who looks along it; at 0 the upper edge points up, and towards
-        ``boresight.azimuth`` where the array looks straight down.
+        Rotation about the boresight, clockwise when looking along it. At 0 the upper edge points up; for an array that
+        looks straight down, towards ``boresight.azimuth``.
 
     Returns
     -------
@@ -66,7 +66,7 @@ def board_to_scene(station: Station) -> Array:
 
 
 def boresight_of(station: Station) -> Boresight:
-    """Where a station's array looks."""
+    """Boresight of a station's array."""
     azimuth, zenith = angles_of(board_to_scene(station)[:, 0])
     return Boresight(azimuth=float(azimuth), downtilt=float(zenith) - 0.5 * np.pi)
 
@@ -78,7 +78,7 @@ def _board(mounting: Mounting) -> Array:
 
 
 def _euler(rotation: Array) -> tuple[float, float, float]:
-    """Bearing, downtilt and slant of a rotation; where only their sum or difference counts, the slant is 0."""
+    """Bearing, downtilt and slant of a rotation; the slant is 0 if only its sum with the bearing is determined."""
     downtilt = float(np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0)))
     if np.hypot(rotation[2, 1], rotation[2, 2]) < 1e-9:
         return float(np.arctan2(-rotation[0, 1], rotation[1, 1])), downtilt, 0.0

@@ -1,4 +1,4 @@
-"""Ranges of settings, stated beside their types and checked in one way.
+"""Ranges of settings, stated in their type annotations and checked by one function.
 
 >>> @dataclass(frozen=True, kw_only=True)
 ... class Settings:
@@ -24,9 +24,9 @@ class Limits:
     Attributes
     ----------
     least, above : float, optional
-        The number is at least the one, or above the other.
+        The number is at least ``least``, or greater than ``above``.
     below : float, optional
-        The number is below this one.
+        The number is less than this.
     most : float, optional
         The number is at most this one.
     """
@@ -62,7 +62,7 @@ def check_limits(settings: Any) -> None:
     Raises
     ------
     SettingsError
-        When a field is no number of its type, or out of its range.
+        When a field is not a number of its type, or out of its range.
     """
     for name, kind, limits in _limited_fields(settings.__class__):
         value: Any = getattr(settings, name)

@@ -1,4 +1,4 @@
-"""Words for what is wrong with a document: where it is, what was found, and the key that was meant."""
+"""Texts for problems of a document: the field, the value found, and the probable key."""
 
 import difflib
 import math
@@ -11,17 +11,17 @@ Path = tuple[str | int, ...]
 
 
 def path_text(path: Path) -> str:
-    """Write a path as people do: ``measurements[0].azimuth_deg``."""
+    """Format a path: ``measurements[0].azimuth_deg``."""
     text = ""
     for step in path:
-        # What is no plain name is quoted, and its control characters with it.
+        # Keys that are not plain names are quoted, which escapes control characters.
         plain = isinstance(step, str) and step.isidentifier() and len(step) <= _MAX_SHOWN
         text += f".{step}" if plain else f"[{step if isinstance(step, int) else repr(shortened(step))}]"
     return text.removeprefix(".")
 
 
 def shown(value: object) -> str:
-    """Name a value of a document in a message, briefly and in the words of JSON."""
+    """Describe a value of a document briefly, with JSON's names of types."""
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
     if isinstance(value, Mapping):
@@ -40,12 +40,12 @@ def shown(value: object) -> str:
 
 
 def unknown_key(name: str, known: Collection[str]) -> str:
-    """Say that a key is unknown, and which was meant or which there are."""
+    """Report an unknown key, with the most similar key or a list of all."""
     close = difflib.get_close_matches(shortened(name), known, n=1)
     remedy = f"did you mean {close[0]}?" if close else f"leave it out or use one of {', '.join(known)}"
     return f"is an unknown key; {remedy}"
 
 
 def shortened(text: str) -> str:
-    """Cut a long text."""
+    """Shorten a long text."""
     return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."

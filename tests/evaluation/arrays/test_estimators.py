@@ -108,7 +108,7 @@ def test_smoothing_tells_copies_of_one_signal_apart() -> None:
     assert num_sources(np.linalg.eigvalsh(plain), 40, most=6) == 1
     assert num_sources(np.linalg.eigvalsh(smoothed), 40, most=6) >= 2
     assert np.abs(esprit(plain, ARRAY, 2).cosines - waves).max() > 0.1
-    with pytest.raises(ValueError, match="is no part of"):
+    with pytest.raises(ValueError, match="is not part of"):
         smoothed_covariance(copies, ARRAY, PlanarArray(columns=9, rows=4))
 
 

@@ -86,7 +86,7 @@ def test_a_grid_without_a_free_place_says_so(room: Table) -> None:
     full = replace(
         room, scene=replace(room.scene, free_space=replace(room.scene.free_space, free=np.zeros((40, 50, 30), bool)))
     )
-    with pytest.raises(ValueError, match=r"no place of a grid of 1\.0 m is free; make the spacing smaller"):
+    with pytest.raises(ValueError, match=r"no position of a grid of 1\.0 m is free; reduce the spacing"):
         simulate_map(full, spacing=1.0)
 
 

@@ -90,5 +90,5 @@ def test_what_the_method_does_not_know_is_refused(measurements: tuple[Measuremen
 
 def test_a_height_is_refused() -> None:
     report = Report(measurements=(ANGLE,), height=Height(z=1.0, stdev=0.1))
-    with pytest.raises(ReportError, match="knows no height"):
+    with pytest.raises(ReportError, match="does not support a height"):
         sort_for_paper(report, SITE)

@@ -68,7 +68,7 @@ def test_an_unknown_layer_is_refused(capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as end:
         main(["plot", "t.h5", "r.json", "-o", "p.png", "--layers", "rays,beams"])
     assert end.value.code == 2
-    assert "'beams' is no layer" in capsys.readouterr().err
+    assert "'beams' is not a layer" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("along", [0, 1])

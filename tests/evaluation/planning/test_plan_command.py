@@ -42,7 +42,7 @@ def test_two_tables_are_compared(
     assert first.startswith("ab.h5: ")
     assert second.startswith("abc.h5: ")
     assert float(change.split()[1]) > 5.0  # a station more
-    assert "places of abc.h5" in err
+    assert "positions of abc.h5" in err
     assert "change of the error" in picture.read_text(encoding="utf-8")
 
 
@@ -68,7 +68,7 @@ def test_a_map_that_is_no_picture_is_refused(
     capsys: pytest.CaptureFixture[str], screen_path: Path, tmp_path: Path
 ) -> None:
     assert main(["plan", str(screen_path), "-o", str(tmp_path / "map.txt"), "--height", "1"]) == 2
-    assert "map.txt is no name of a picture; end it in .png, .svg or .pdf" in capsys.readouterr().err
+    assert "map.txt is not a valid name of a picture; end it in .png, .svg or .pdf" in capsys.readouterr().err
 
 
 def test_the_place_of_the_picture_is_checked_before_the_work(

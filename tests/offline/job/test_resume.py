@@ -128,7 +128,7 @@ def test_a_full_disk_loses_nothing_finished(tmp_path: Path, whole: BuildSummary)
     former = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (smallest // 2, hard))
-        with pytest.raises(BuildError, match=r"cannot save .*: File too large; nothing finished is lost: free some"):
+        with pytest.raises(BuildError, match=r"cannot save .*: File too large; finished blocks are kept: free some"):
             build_table(site, table, jobs=1)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -239,5 +239,5 @@ def test_a_former_table_that_was_named_must_be_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("tolerance", [-0.01, 1.0, float("nan")])
 def test_a_tolerance_that_is_no_share(tmp_path: Path, tolerance: float) -> None:
-    with pytest.raises(BuildError, match="is no fraction of a cell's mass; give 0 or more, below 1"):
+    with pytest.raises(BuildError, match="is not a fraction of a cell's mass; give 0 or more, below 1"):
         build_table(write_site(tmp_path), tmp_path / "t.h5", tolerance=tolerance)

@@ -271,7 +271,7 @@ def test_what_stands_around_a_model(before: bytes, behind: bytes, save: Callable
 def test_more_behind_the_end_mark_is_told_of(save: Callable[[Model], Path]) -> None:
     path = save(room()[0])
     path.write_bytes(path.read_bytes() + b"#9999=IFCWALL();\n")
-    assert "behind its end mark" in load_scene(path).remarks[0].problem
+    assert "after its end mark" in load_scene(path).remarks[0].problem
 
 
 @needs_ifc

@@ -236,7 +236,7 @@ def test_what_is_no_address_is_refused(text: str):
         ({"publish": "rayfix/+"}, "cannot be published to"),
         ({"publish": "rayfix/{tag}"}, "no placeholder but {target_id}"),
         ({"publish": "rayfix/{"}, "cannot be published to"),
-        ({"topic": "a/#/b"}, "'a/#/b' is no topic filter"),
+        ({"topic": "a/#/b"}, "'a/#/b' is not a topic filter"),
         ({"publish": "silabs/aoa/angle/rayfix/{target_id}"}, "is among those read"),
     ],
 )
@@ -271,7 +271,7 @@ def test_a_hub_that_is_no_address_is_one_line(
 ) -> None:
     assert main([command, str(hall_table_path), "--omlox-hub", "hub:8081"]) == 2
     error = capsys.readouterr().err
-    assert error == "rayfix: omlox hub 'hub:8081' is no address; give that of its API, e.g. http://hub:8081/v2\n"
+    assert error == "rayfix: omlox hub 'hub:8081' is not an address; give that of its API, e.g. http://hub:8081/v2\n"
 
 
 def test_without_the_extra_the_command_says_which(

@@ -208,7 +208,7 @@ def test_what_cannot_be_served_is_said_first(hall_table_path: Path, tmp_path: Pa
         with pytest.raises(ServiceError, match=text):
             serve(hall_table_path, port=0, settings=ServiceSettings(api_keys=tmp_path / keys))
     monkeypatch.setenv(MULTIPROCESS_VARIABLE, str(tmp_path / "nowhere"))
-    with pytest.raises(ServiceError, match="nowhere, where figures cannot be written"):
+    with pytest.raises(ServiceError, match="nowhere, where metrics cannot be written"):
         serve(hall_table_path, port=0)
     monkeypatch.setenv(MULTIPROCESS_VARIABLE, str(tmp_path))
     monkeypatch.setattr("os.posix_fallocate", no_room)

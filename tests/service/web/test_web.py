@@ -244,7 +244,7 @@ def test_arrivals_share_a_clock_and_differences_a_reference(table: Table):
 
 
 def test_places_without_signal_are_refused(web: RunningApp, table: Table):
-    with pytest.raises(ReportError, match="in a solid or outside"):
+    with pytest.raises(ReportError, match="in a solid or outdoors"):
         simulate(table, (-5, 0, 1), kinds=["aoa"], angle_stdev=1, range_stdev=1, rng=np.random.default_rng(1))
     response = web.post("/v1/simulations", {"position": [1, 2], "kinds": ["tod"], "seeds": 1})
     assert response.status_code == 422

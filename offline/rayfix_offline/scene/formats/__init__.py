@@ -1,1 +1,1 @@
-"""Scene files of all kinds, each read into objects with their places."""
+"""Readers of scene files, one for each format; each returns objects with their transforms."""

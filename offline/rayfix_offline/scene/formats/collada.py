@@ -30,7 +30,7 @@ def read_collada(path: Path) -> Contents:
     Raises
     ------
     SceneError
-        When the file cannot be read in full: it is no XML, or refers to what is not there.
+        When the file cannot be read completely: it is not XML, or refers to missing elements.
     """
     content = path.read_bytes()
     refuse_hostile_xml(path, content)
@@ -109,8 +109,8 @@ class _Reader:
             self.remark(
                 "left out",
                 f"{counted(len(beside), 'geometry').replace('geometrys', 'geometries')} left out, such as "
-                f"'{beside[0][:50]}', which no node of the scene shows",
-                "add nodes for them, if they are there",
+                f"'{beside[0][:50]}', which no node of the scene uses",
+                "add nodes for them if they belong to the scene",
             )
 
     def target(self, url: str, kind: str) -> Element:
@@ -118,7 +118,7 @@ class _Reader:
             self.refuse(f"it refers to '{url[:60]}', which is in another file")
         found = self.named.get((kind, url[1:]), [])
         if not found:
-            self.refuse(f"it refers to the {kind} '{url[:60]}', which is not there")
+            self.refuse(f"it refers to the {kind} '{url[:60]}', which is missing")
         if len(found) > 1:
             self.refuse(f"it refers to the {kind} '{url[:60]}', of which there are {len(found)}")
         return found[0]
@@ -191,7 +191,7 @@ class _Reader:
         if symbol in bound:
             self.remark(
                 "material",
-                f"the material '{target[:50]}' is not there: '{symbol[:50]}' is taken, as the geometry calls it",
+                f"the material '{target[:50]}' is missing: '{symbol[:50]}' is used, its name in the geometry",
                 "export the scene again",
             )
         return symbol
@@ -228,14 +228,14 @@ class _Reader:
                 elif kind_of(each) not in ("source", "vertices", "extra"):
                     self.remark(
                         "left out",
-                        f"the geometry '{name[:50]}' has <{kind_of(each)[:30]}>, which is not known and left out",
+                        f"the geometry '{name[:50]}' has <{kind_of(each)[:30]}>, which is unknown and left out",
                         "export triangles",
                     )
         self.geometries[name] = (np.concatenate([*vertices, np.zeros((0, 3))]), surfaces)
         return self.geometries[name]
 
     def inputs(self, surface: Element, name: str) -> tuple[str, int, int]:
-        """Source of a surface's positions, numbers of each corner, and which of them is the position's."""
+        """Source of a surface's positions, number of indices per corner, and which of them is the position's."""
         found, stride = None, 1
         for each in surface:
             if kind_of(each) == "input":
@@ -267,7 +267,7 @@ class _Reader:
         if stride < 3 or max(places) >= stride:
             self.refuse(f"the source '{url[:50]}' has no X, Y and Z")
         if offset + stride * count > len(values):
-            self.refuse(f"the source '{url[:50]}' has {len(values):,} numbers, fewer than its accessor tells")
+            self.refuse(f"the source '{url[:50]}' has {len(values):,} numbers, fewer than its accessor states")
         return values[offset : offset + stride * count].reshape(count, stride)[:, places]
 
     def faces(
@@ -287,7 +287,7 @@ class _Reader:
         inner = [ring for each in holes.values() for ring in each]
         all_corners = np.concatenate([*rings, *inner, np.zeros(0, np.int64)])
         if len(all_corners) and not (all_corners.min() >= 0 and all_corners.max() < len(points)):
-            self.refuse(f"the geometry '{name[:50]}' has a corner at a vertex that is not there, among {len(points):,}")
+            self.refuse(f"the geometry '{name[:50]}' has a corner at a vertex beyond its {len(points):,}")
         if kind in ("tristrips", "trifans"):
             self.compare(surface, len(rings), name)
             if kind == "tristrips":
@@ -296,7 +296,7 @@ class _Reader:
             return np.concatenate([*fans, np.zeros((0, 3), np.int64)])
         if kind == "triangles":
             if len(all_corners) % 3:
-                self.refuse(f"the geometry '{name[:50]}' has {len(all_corners):,} corners, which are no triangles")
+                self.refuse(f"the geometry '{name[:50]}' has {len(all_corners):,} corners, not a multiple of 3")
             self.compare(surface, len(all_corners) // 3, name)
             return all_corners.reshape(-1, 3)
         if kind == "polylist":
@@ -318,19 +318,19 @@ class _Reader:
             corners, sizes = corners[np.repeat(sizes >= 3, sizes)], sizes[sizes >= 3]
         cut = cut_polygons(points, corners, sizes, holes=holes)
         starts: NDArray[np.int64] = np.cumsum(sizes) - sizes
-        for told in cut.remarks(points, corners, starts):
-            self.remark(told.kind, f"in the geometry '{name[:50]}', {told.problem}", told.remedy)
+        for remark in cut.remarks(points, corners, starts):
+            self.remark(remark.kind, f"in the geometry '{name[:50]}', {remark.problem}", remark.remedy)
         return cut.faces
 
     def compare(self, surface: Element, number: int, name: str) -> None:
-        """Tell when there are more or fewer than the file says."""
+        """Warn if the count differs from the one that the file states."""
         said = self.number(surface.get("count", str(number)), name)
         if said != number:
             self.remark(
                 "count",
-                f"the geometry '{name[:50]}' says that it has {said:,} in <{kind_of(surface)}>, and has {number:,}: "
+                f"the geometry '{name[:50]}' states {said:,} in <{kind_of(surface)}>, and has {number:,}: "
                 "all of these are read",
-                "export the scene again, and see that all is there",
+                "export the scene again, and check that it is complete",
             )
 
     def ring(self, element: Element, stride: int, offset: int, name: str) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ def transform_of(node: Element) -> NDArray[np.float64]:
     Raises
     ------
     ValueError
-        When an element has not its numbers.
+        When an element has a wrong number of values.
     """
     out = np.eye(4)
     for element in node:
@@ -27,13 +27,13 @@ def transform_of(node: Element) -> NDArray[np.float64]:
             except ValueError:
                 numbers = np.zeros(0)
             if len(numbers) != SIZES[kind]:
-                raise ValueError(f"a <{kind}> that has not {SIZES[kind]} numbers")
+                raise ValueError(f"a <{kind}> without exactly {SIZES[kind]} numbers")
             out = out @ _matrix(kind, numbers)
     return out
 
 
 def rotation(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    """Return the turn about an axis by an angle in radians, shape (4, 4) (Rodrigues' formula)."""
+    """Return the rotation about an axis by an angle in radians, shape (4, 4) (Rodrigues' formula)."""
     out = np.eye(4)
     length = float(np.linalg.norm(axis))
     if length > 0.0:

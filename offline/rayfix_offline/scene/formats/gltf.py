@@ -1,4 +1,4 @@
-"""glTF 2: nodes with meshes, and the extensions that change what is where."""
+"""glTF 2: nodes with meshes, and extensions that change geometry."""
 
 import json
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from rayfix_tables.errors import SceneError
 INSTANCING = "EXT_mesh_gpu_instancing"
 
 READ = (DRACO, *MESHOPT, INSTANCING, "KHR_mesh_quantization")
-"""Extensions that change geometry: read, or refused where they come up."""
+"""Extensions that change geometry: they are read, or refused where they occur."""
 
 LOOKS = (
     "KHR_materials_",
@@ -30,7 +30,7 @@ LOOKS = (
     "MSFT_texture_",
     "MSFT_lod",
 )
-"""Beginnings of the names of extensions that change how things look, and not where they are."""
+"""Prefixes of extensions that change appearance only, not geometry."""
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
 
@@ -49,14 +49,14 @@ def read_gltf(path: Path) -> Contents:
     Raises
     ------
     SceneError
-        When the file cannot be read in full: it is damaged, or needs an extension that is not known.
+        When the file cannot be read completely: it is damaged, or needs an unknown extension.
     """
     content = path.read_bytes()
     refuse_hostile_gltf(path, content)
     try:
         document = json.loads(json_of(content))
         if not isinstance(document, dict):
-            raise ValueError("it is no object")
+            raise ValueError("it is not an object")
     except (ValueError, RecursionError) as error:
         raise SceneError(f"{path} cannot be read as glTF ({str(error)[:80]}); export the scene again") from error
     reader = _Reader(path, document, _binary_chunk(path, content))
@@ -107,7 +107,7 @@ class _Reader:
             mesh = self.mesh(node)
             if "skin" in node:
                 self.remark(
-                    "a node is bent by a skin: it is read in its rest pose", "apply the armature before the export"
+                    "a node is deformed by a skin: it is read in its rest pose", "apply the armature before the export"
                 )
             name = str(node.get("name") or self.accessors.entry("meshes", node["mesh"]).get("name") or f"node {number}")
             places = self.instances(node)
@@ -156,7 +156,7 @@ class _Reader:
         for name in entry.get("extensions", {}):
             if not _known(name):
                 self.remark(
-                    f"a {kind} has the extension {str(name)[:60]}, which is not known: what it changes is not read",
+                    f"a {kind} has the extension {str(name)[:60]}, which is unknown: its changes are not read",
                     "export the scene without it",
                 )
 
@@ -167,14 +167,14 @@ class _Reader:
             name = str(nodes[beside[0]].get("name", beside[0]))[:50]
             number = counted(len(beside), "node")
             self.remark(
-                f"{number} with a mesh left out, such as '{name}', which the file's scene does not show",
-                "add them to that scene, if they are there",
+                f"{number} with a mesh left out, such as '{name}', which the file's scene does not contain",
+                "add them to that scene if they belong to it",
             )
         used = {node.get("mesh") for node in nodes}
         unused = [n for n in range(len(self.document.get("meshes", []))) if n not in used]
         if unused:
             number = "a mesh" if len(unused) == 1 else f"{len(unused):,} meshes"
-            self.remark(f"{number} left out that no node shows", "add nodes for them, if they are there")
+            self.remark(f"{number} left out that no node uses", "add nodes for them if they belong to the scene")
 
     def nodes(self) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """Nodes of the scene with their transforms."""
@@ -191,7 +191,7 @@ class _Reader:
             number, outer = stack.pop()
             node = self.accessors.entry("nodes", number)
             if number in seen:
-                self.accessors.refuse(f"nodes[{number}] is shown twice")
+                self.accessors.refuse(f"nodes[{number}] occurs twice")
             seen.add(number)
             transform = outer @ self.transform(node, number)
             yield number, transform
@@ -210,11 +210,11 @@ class _Reader:
         missing = {"translation": (0, 0, 0), "rotation": (0, 0, 0, 1), "scale": (1, 1, 1)}.get(key)
         values = np.asarray(node.get(key, missing), np.float64)
         if values.shape != (count,):
-            self.accessors.refuse(f"nodes[{number}].{key} has not {count} numbers")
+            self.accessors.refuse(f"nodes[{number}].{key} does not have {count} numbers")
         return values
 
     def instances(self, node: dict[str, Any]) -> list[NDArray[np.float64]]:
-        """Places of a node's mesh within the node."""
+        """Return the transforms of the instances of a node's mesh within the node."""
         extension = node.get("extensions", {}).get(INSTANCING)
         if extension is None:
             return [np.eye(4)]
@@ -227,7 +227,7 @@ class _Reader:
         counts = {len(column) for column in columns.values()}
         if len(counts) != 1:
             self.accessors.refuse(
-                f"the node '{str(node.get('name'))[:50]}' has {INSTANCING} without one number of instances"
+                f"the node '{str(node.get('name'))[:50]}' has {INSTANCING} with attributes of different counts"
             )
         count = counts.pop()
         shifts = columns.get("TRANSLATION", np.zeros((count, 3)))
@@ -236,7 +236,7 @@ class _Reader:
         return [_compose(*each) for each in zip(shifts, turns, scales, strict=True)]
 
     def mesh(self, node: dict[str, Any]) -> _Mesh:
-        """Triangles of a node's mesh; with weights of its own, they are its own."""
+        """Triangles of a node's mesh; a node with its own morph weights has its own triangles."""
         number = node["mesh"]
         mesh = self.accessors.entry("meshes", number)
         weights = node.get("weights", mesh.get("weights"))
@@ -298,7 +298,7 @@ class _Reader:
             points = self.accessors.read(position, 3)
             corners = np.arange(len(points)) if indices is None else self.accessors.indices(indices)
             if mode == TRIANGLES and len(corners) % 3:
-                self.accessors.refuse(f"{where} has {len(corners):,} indices, which are no triangles")
+                self.accessors.refuse(f"{where} has {len(corners):,} indices, not a multiple of 3")
             if mode == TRIANGLES:
                 faces = corners.reshape(-1, 3)
             elif mode == STRIP:
@@ -311,14 +311,14 @@ class _Reader:
             else:
                 self.accessors.refuse(f"{where} is of the mode {str(mode)[:20]}, which glTF does not have")
         if len(faces) and not (faces.min() >= 0 and faces.max() < len(points)):
-            self.accessors.refuse(f"{where} has a triangle of position {faces.max():,}, among {len(points):,}")
+            self.accessors.refuse(f"{where} has the index {faces.max():,}, beyond its {len(points):,} positions")
         return points, faces
 
 
 def _compose(
     translation: NDArray[np.float64], rotation: NDArray[np.float64], scale: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Matrix of a scale, then a turn by a quaternion (x, y, z, w), then a shift."""
+    """Matrix of a scale, then a rotation by a quaternion (x, y, z, w), then a translation."""
     length = np.linalg.norm(rotation)
     x, y, z, w = rotation / length if length > 0.0 else (0.0, 0.0, 0.0, 1.0)
     out = np.eye(4)

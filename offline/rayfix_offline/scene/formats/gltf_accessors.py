@@ -1,4 +1,4 @@
-"""What glTF keeps in buffers: plain, with a stride, normalised, sparse, or compressed with Draco."""
+"""Arrays in glTF buffers: plain, with a stride, normalised, sparse, or compressed with Draco."""
 
 import base64
 import binascii
@@ -20,10 +20,10 @@ MESHOPT = {
     "EXT_meshopt_compression": "gltf-transform copy in.glb out.glb",
     "KHR_meshopt_compression": "gltfpack -noq -kn -km -i in.glb -o out.glb",
 }
-"""Compression that is not read, and a command that takes it off: gltf-transform does not know the younger one."""
+"""Unsupported compressions, each with a command that removes it; gltf-transform does not support the newer one."""
 
 _MOST = 200_000_000
-"""Values of an accessor that has none in the file, but is sparse."""
+"""Largest number of values of a sparse accessor without data in the file."""
 
 
 class Accessors:
@@ -50,7 +50,7 @@ class Accessors:
         return SceneFolder(self.path.parent, self.path.parent)
 
     def refuse(self, problem: str, remedy: str = "export the scene again") -> NoReturn:
-        """Raise what is wrong with the file.
+        """Raise an error for a problem of the file.
 
         Raises
         ------
@@ -62,19 +62,19 @@ class Accessors:
         """Return an entry of one of the document's lists."""
         entries = self.document.get(kind, [])
         if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < len(entries):
-            self.refuse(f"it refers to {kind}[{str(number)[:20]}], which is not there")
+            self.refuse(f"it refers to {kind}[{str(number)[:20]}], which does not exist")
         entry = entries[number]
         if not isinstance(entry, dict):
-            self.refuse(f"{kind}[{number}] is no object")
+            self.refuse(f"{kind}[{number}] is not an object")
         return entry
 
     def read(self, number: Any, width: int) -> NDArray[np.float64]:
-        """Return an accessor's values, normalised ones as the fractions that they stand for.
+        """Return an accessor's values; normalised integers are converted to fractions.
 
         Parameters
         ----------
         width : int
-            Components that its elements have.
+            Components of each element.
 
         Returns
         -------
@@ -92,11 +92,11 @@ class Accessors:
         """Return an accessor's values as indices, shape (count,)."""
         accessor = self.entry("accessors", number)
         if accessor.get("componentType") not in (5121, 5123, 5125):
-            self.refuse(f"accessors[{number}] has indices that are no unsigned integers")
+            self.refuse(f"accessors[{number}] has indices that are not unsigned integers")
         return self._stored(accessor, number, 1).reshape(-1).astype(np.int64)
 
     def has_data(self, number: Any) -> bool:
-        """Whether an accessor has values of its own, and not only those of a compressed primitive."""
+        """Whether an accessor has its own values, besides those of a compressed primitive."""
         accessor = self.entry("accessors", number)
         return "bufferView" in accessor or "sparse" in accessor
 
@@ -104,7 +104,7 @@ class Accessors:
         where = f"accessors[{number}]"
         kind = accessor.get("componentType")
         if kind not in COMPONENTS or WIDTHS.get(str(accessor.get("type"))) != width:
-            self.refuse(f"{where} is no {width}-vector of numbers")
+            self.refuse(f"{where} is not a {width}-vector of numbers")
         count = self.whole(accessor, "count", where)
         sparse = accessor.get("sparse")
         if "bufferView" in accessor:
@@ -120,16 +120,16 @@ class Accessors:
         some = self.whole(sparse, "count", f"{where}.sparse")
         at, new = sparse.get("indices", {}), sparse.get("values", {})
         if at.get("componentType") not in (5121, 5123, 5125):
-            self.refuse(f"{where}.sparse has indices that are no unsigned integers")
+            self.refuse(f"{where}.sparse has indices that are not unsigned integers")
         places = self._view(at, COMPONENTS[at["componentType"]], 1, some, where)[:, 0].astype(np.int64)
         if some and places.max() >= count:
-            self.refuse(f"{where}.sparse changes a value that is not there")
+            self.refuse(f"{where}.sparse changes a value beyond the accessor's count")
         out = out.copy()
         out[places] = self._view(new, COMPONENTS[kind], width, some, where)
         return out
 
     def whole(self, entry: dict[str, Any], key: str, where: str, missing: int | None = None) -> int:
-        """Return a number that is no less than 0 and no fraction."""
+        """Return an integer of 0 or more."""
         value = entry.get(key, missing)
         if isinstance(value, float) and value.is_integer():
             value = int(value)
@@ -145,7 +145,7 @@ class Accessors:
         size = np.dtype(kind).itemsize * width
         stride = stride or size
         if stride < size:
-            self.refuse(f"bufferViews[{number}].byteStride is {stride}, less than its elements have")
+            self.refuse(f"bufferViews[{number}].byteStride is {stride}, less than the size of an element")
         if count and offset + stride * (count - 1) + size > len(data):
             self.refuse(f"{where} goes beyond bufferViews[{number}]")
         if not count:
@@ -171,7 +171,7 @@ class Accessors:
         return data[start : start + length], self.whole(view, "byteStride", where, 0)
 
     def _is_there(self, number: Any) -> bool:
-        """Whether a buffer has a content; one that stands in for compressed data may have none."""
+        """Whether a buffer has content; a placeholder for compressed data may have none."""
         return "uri" in self.entry("buffers", number) or (number == 0 and self.binary is not None)
 
     def _buffer(self, number: Any) -> bytes:
@@ -185,7 +185,7 @@ class Accessors:
                 self.refuse(f"buffers[{number}] has no content")
             data = self.binary
         elif not isinstance(uri, str):
-            self.refuse(f"buffers[{number}].uri is no text")
+            self.refuse(f"buffers[{number}].uri is not a text")
         elif uri.startswith("data:"):
             head, _, body = uri.partition(",")
             if not head.endswith(";base64"):
@@ -193,11 +193,11 @@ class Accessors:
             try:
                 data = base64.b64decode(body, validate=True)
             except (binascii.Error, ValueError) as error:
-                self.refuse(f"buffers[{number}] has data that are no base64 ({error})")
+                self.refuse(f"buffers[{number}] has data that are not base64 ({error})")
         else:
             data = self._file(uri)
         if len(data) < length:
-            self.refuse(f"buffers[{number}] has {len(data):,} bytes and not {length:,}")
+            self.refuse(f"buffers[{number}] has {len(data):,} bytes instead of {length:,}")
         self._buffers[number] = data[:length]
         return self._buffers[number]
 
@@ -206,19 +206,19 @@ class Accessors:
         if found is None:
             if self._folder.refused:
                 raise outside_error(str(self.path), uri)
-            self.refuse(f"it needs '{uri[:200]}', which is not there", "put that file beside it")
+            self.refuse(f"it needs '{uri[:200]}', which is missing", "put that file next to it")
         try:
             return found.read_bytes()
         except OSError as error:
             self.refuse(f"'{uri[:200]}' cannot be read: {error.strerror}", "correct its permissions")
 
     def draco(self, extension: dict[str, Any], count: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return positions and triangles of a primitive that is compressed with Draco.
+        """Return positions and triangles of a primitive compressed with Draco.
 
         Parameters
         ----------
         count : int
-            Positions that the primitive's accessor tells of.
+            Number of positions that the primitive's accessor states.
         """
         import DracoPy
 
@@ -229,9 +229,9 @@ class Accessors:
             faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
             positions = next(each["data"] for each in mesh.attributes if each["unique_id"] == number)
             points = np.asarray(positions, np.float64).reshape(-1, 3)
-        except Exception as error:  # whatever its decoder makes of damaged data
+        except Exception as error:  # the decoder raises various exceptions for damaged data
             reason = str(error)[:80] or type(error).__name__
             self.refuse(f"its data compressed with {DRACO} cannot be decoded: {reason}")
         if len(points) != count:
-            self.refuse(f"its Draco data have {len(points):,} positions and not {count:,}")
+            self.refuse(f"its Draco data have {len(points):,} positions instead of {count:,}")
         return points, faces

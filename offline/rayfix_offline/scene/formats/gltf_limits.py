@@ -1,4 +1,4 @@
-"""Limits of glTF files' nodes, checked before a reader follows them."""
+"""Limits on the nodes of glTF files, checked before a reader traverses them."""
 
 import codecs
 import json
@@ -11,14 +11,14 @@ _JSON_CHUNK = b"JSON"
 
 
 def refuse_hostile_gltf(path: Path, content: bytes) -> None:
-    """Refuse nodes that are in each other in a circle, in two others, or too deeply.
+    """Refuse nodes that form a cycle, have two parents, or are nested too deeply.
 
-    What is no glTF at all is left for the reader to tell.
+    A file that is not glTF is left to the reader's error.
 
     Raises
     ------
     SceneError
-        When the nodes are no trees, or more than 200 deep.
+        When the nodes are not trees, or more than 200 deep.
     """
     try:
         nodes = json.loads(json_of(content))["nodes"]
@@ -33,7 +33,7 @@ def refuse_hostile_gltf(path: Path, content: bytes) -> None:
             if child in parents:
                 raise SceneError(f"{path} has the node {child} in two other nodes; export the scene again, as trees")
             parents[child] = number
-    # From the roots downwards; what is in a circle has no root.
+    # From the roots downwards; a cycle has no root.
     level, found = [number for number in range(len(children)) if number not in parents], 0
     for depth in range(MOST_NESTED + 1):
         if not level:
@@ -46,11 +46,11 @@ def refuse_hostile_gltf(path: Path, content: bytes) -> None:
         found += len(level)
         level = [child for number in level for child in children[number]]
     if found < len(children):
-        raise SceneError(f"{path} has nodes that lie in each other in a circle; export the scene again, as trees")
+        raise SceneError(f"{path} has nodes that form a cycle; export the scene again, as trees")
 
 
 def json_of(content: bytes) -> bytes:
-    """Return the JSON of a file, which in a binary one is the first chunk.
+    """Return the JSON of a file; in a binary file it is the first chunk.
 
     Raises
     ------

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import ifcopenshell
 
 NO_BODIES = ("IfcOpeningElement", "IfcSpace", "IfcVirtualElement", "IfcAnnotation", "IfcGrid")
-"""Classes whose geometry is not there to be touched."""
+"""Classes with geometry that is not physical."""
 
 CATEGORIES = {
     "aluminium": "metal",
@@ -28,13 +28,13 @@ CATEGORIES = {
     "block": "brick",
     "gypsum": "plasterboard",
 }
-"""Material of ITU-R P.2040 for what IFC 4 suggests as ``Category`` of a material and P.2040 calls otherwise."""
+"""Materials of ITU-R P.2040 for values that IFC 4 suggests for a material's ``Category``, where the names differ."""
 
 BODIES = ("body", "body-fallback", "facetation", "tessellation", "surface", "")
-"""Identifiers of representations that are surfaces, in lower case; not axes, plans and boxes."""
+"""Identifiers, in lower case, of representations by surfaces, as opposed to axes, plans and boxes."""
 
 NEWEST = "IFC4X3_ADD2"
-"""The schema that files called IFC4X3 have: an addendum that corrects texts."""
+"""Schema of files that state IFC4X3: an addendum that corrects only texts."""
 
 MOST_NAMED = 6
 
@@ -48,9 +48,9 @@ def read_ifc(path: Path) -> Contents:
     Returns
     -------
     Contents
-        An object's name is its product's, with its GlobalId. An object has one material, so that a product of several
-        is several objects; it is called ``itu_concrete`` and so on where style, material or the material's category
-        tell one of ITU-R P.2040.
+        An object's name is its product's, with its GlobalId. An object has one material; a product of several materials
+        becomes several objects. The material is named ``itu_concrete`` and so on if style, material or the material's
+        category identify one of ITU-R P.2040.
 
     Raises
     ------
@@ -67,21 +67,21 @@ def read_ifc(path: Path) -> Contents:
     remarks: list[Remark] = []
     content = _content(path, remarks)
     try:
-        ifcopenshell.get_log()  # whatever was said of other files
+        ifcopenshell.get_log()  # discards messages about other files
         file = ifcopenshell.file.from_string(content)
         placed = list(_products(file))
         remarks += _missing(file, placed)
         remarks += _errors(str(ifcopenshell.get_log()))
-    except Exception as error:  # ifcopenshell raises whatever a damaged file brings up
+    except Exception as error:  # ifcopenshell raises various exceptions for damaged files
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise SceneError(f"{path} cannot be read as IFC ({reason}); export the model again") from error
     return Contents(objects=tuple(each for _, each in placed), remarks=tuple(remarks), metres=1.0, up="z")
 
 
 def _content(path: Path, remarks: list[Remark]) -> str:
-    """Text of the file from its first word to its end mark, with the newest schema's full name.
+    """Text of the file from its first word to its end mark; the schema IFC4X3 is replaced by its addendum's name.
 
-    ifcopenshell takes what there is of a truncated file, and what comes behind the end mark.
+    ifcopenshell accepts truncated files, and reads beyond the end mark.
     """
     content = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
     end = None
@@ -90,14 +90,14 @@ def _content(path: Path, remarks: list[Remark]) -> str:
     if end is None:
         raise SceneError(f"{path} cannot be read as IFC (it does not end as such a file does); export the model again")
     if _REMARKS.sub(b"", content[end.end() :]).strip(b" \t\r\n\0\x1a"):
-        problem = f"the file has {len(content) - end.end():,} bytes behind its end mark, which are not read"
+        problem = f"the file has {len(content) - end.end():,} bytes after its end mark, which are not read"
         remarks.append(Remark(kind="left out", problem=problem, remedy="export the model again"))
     text = content[: end.end()].decode("latin-1")
     return re.sub(r"(FILE_SCHEMA\s*\(\s*\(\s*')IFC4X3(')", rf"\g<1>{NEWEST}\g<2>", text, count=1, flags=re.IGNORECASE)
 
 
 def _products(file: "ifcopenshell.file") -> Iterator[tuple[str, Placed]]:
-    """Give GlobalIds and objects."""
+    """Yield GlobalIds and objects."""
     import ifcopenshell.geom
     from ifcopenshell.util.element import get_materials
 
@@ -134,7 +134,7 @@ def _name(product: Any) -> str:
 
 
 def _missing(file: "ifcopenshell.file", placed: list[tuple[str, Placed]]) -> Iterator[Remark]:
-    """Tell of products that have a body, but no triangles."""
+    """Warn of products that have a body but no triangles."""
     found = {guid for guid, each in placed if len(each.faces)}
     missing = [
         product
@@ -159,7 +159,7 @@ def _has_body(product: Any) -> bool:
 
 
 def _errors(log: str) -> Iterator[Remark]:
-    """Tell what else ifcopenshell could not do, such as to cut an opening."""
+    """Warn of other problems that ifcopenshell reports, such as openings that it could not cut."""
     entries = re.split(r"^(?=\[\w+\] )", log, flags=re.MULTILINE)
     problems = []
     for entry in entries:
@@ -179,8 +179,8 @@ def _errors(log: str) -> Iterator[Remark]:
 def _material(style: str | None, materials: list[Any]) -> str | None:
     """Name of a surface's material, from its style and the product's materials.
 
-    What ITU-R P.2040 knows comes first, from the most particular to the most general: the surface's style, the names of
-    the product's materials (a wall's layers in their order), their categories.
+    Names of ITU-R P.2040 take precedence, from the most specific to the most general: the surface's style, the names of
+    the product's materials (a wall's layers in order), their categories.
     """
     own = [material for material in materials if material.Name == style] or materials
     categories = [(getattr(material, "Category", None) or "").lower() for material in own]

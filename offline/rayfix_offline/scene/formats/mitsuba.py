@@ -1,8 +1,8 @@
 """Mitsuba XML scenes, as Sionna RT and Blender's Mitsuba exporter write them.
 
-Of the format, what a building needs: shapes of type ``ply`` with ``to_world`` transforms, and the names of their
-materials. Sionna RT 1 says ``<bsdf type="itu-radio-material">`` with a ``type``; before, and from Blender, it is any
-bsdf whose id is like ``mat-itu_concrete``. Cameras, lights and integrators are passed over.
+Supports the parts of the format that buildings need: shapes of type ``ply`` with ``to_world`` transforms, and the names
+of their materials. Sionna RT 1 writes ``<bsdf type="itu-radio-material">`` with a ``type``; earlier versions and
+Blender write any bsdf with an id like ``mat-itu_concrete``. Cameras, lights and integrators are ignored.
 """
 
 import re
@@ -32,12 +32,13 @@ def read_mitsuba(path: Path) -> Contents:
     Returns
     -------
     Contents
-        An object's material bears the name of the shape's, ``itu_concrete`` for whatever stands for it.
+        An object has the material name of its shape; the different spellings of ITU-R materials become ``itu_concrete``
+        and so on.
 
     Raises
     ------
     SceneError
-        When the file or one of its meshes cannot be read, or holds what is not supported.
+        When the file or one of its meshes cannot be read, or has unsupported elements.
     """
     root = _parse(path)
     defaults = {element.get("name", ""): element.get("value", "") for element in root.iter("default")}
@@ -45,7 +46,7 @@ def read_mitsuba(path: Path) -> Contents:
         if len(value) > _LONGEST_DEFAULT:
             raise SceneError(
                 f"{path} has a default '{key[:50]}' of {len(value):,} characters, more than {_LONGEST_DEFAULT}; "
-                "write the value where it belongs"
+                "write the value where it is used"
             )
     for element in root.iter():
         for key, value in element.attrib.items():
@@ -65,12 +66,12 @@ def read_mitsuba(path: Path) -> Contents:
             raise SceneError(f"{where} is of type '{kind}', which is not supported; export it as ply")
         transform = _to_world(shape, where)
         material = _shape_material(shape, materials, where)
-        mesh, told = _mesh(path, shape, where)
+        mesh, remarked = _mesh(path, shape, where)
         materials_of, face_materials = one_material(material, len(mesh.faces))
         placed.append(
             replace(mesh, name=name, materials=materials_of, face_materials=face_materials, transform=transform)
         )
-        remarks += [replace(each, problem=f"shape '{name}': {each.problem}") for each in told]
+        remarks += [replace(each, problem=f"shape '{name}': {each.problem}") for each in remarked]
         num_triangles += len(mesh.faces)
         if num_triangles > MOST_TRIANGLES:
             raise SceneError(
@@ -92,17 +93,17 @@ def _parse(path: Path) -> ElementTree.Element:
     except (ElementTree.ParseError, ValueError) as error:
         raise SceneError(f"{path} cannot be read as XML ({error}); {_UNREADABLE}") from error
     if root.tag != "scene":
-        raise SceneError(f"{path} is no Mitsuba scene: its root is <{root.tag[:50]}> and not <scene>; {_UNREADABLE}")
+        raise SceneError(f"{path} is not a Mitsuba scene: its root is <{root.tag[:50]}>, not <scene>; {_UNREADABLE}")
     return root
 
 
 def _substitute(value: str, defaults: dict[str, str]) -> str:
-    # Once, and not in what comes in: defaults that name each other could grow without bound.
+    # Replaced once, not recursively: defaults that refer to each other could grow without bound.
     return re.sub(r"\$(\w+)", lambda match: defaults.get(match[1], match[0]), value)
 
 
 def _material_name(bsdf: ElementTree.Element) -> str | None:
-    """Name of a bsdf's material, None when it bears none."""
+    """Name of a bsdf's material, None if it has none."""
     for element in bsdf.iter("bsdf"):
         if element.get("type") == "itu-radio-material":
             kind = element.find("string[@name='type']")
@@ -133,7 +134,7 @@ def _shape_material(shape: ElementTree.Element, materials: dict[str, str | None]
 
 
 def _mesh(path: Path, shape: ElementTree.Element, where: str) -> tuple[Placed, tuple[Remark, ...]]:
-    """Triangles of a shape's file, and what there is to say about it."""
+    """Triangles of a shape's file, and remarks about it."""
     element = shape.find("string[@name='filename']")
     if element is None or not element.get("value"):
         raise SceneError(f'{where} names no file; add <string name="filename" value="....ply"/>')
@@ -142,7 +143,7 @@ def _mesh(path: Path, shape: ElementTree.Element, where: str) -> tuple[Placed, t
     if file is None:
         raise outside_error(where, name)
     if not is_file(file):
-        raise SceneError(f"{where} needs {name}, which is not there; put it beside the scene file")
+        raise SceneError(f"{where} needs {name}, which is missing; put it next to the scene file")
     contents = read_ply(file)
     mesh = contents.objects[0]
     if not len(mesh.faces):
@@ -151,7 +152,7 @@ def _mesh(path: Path, shape: ElementTree.Element, where: str) -> tuple[Placed, t
 
 
 def _to_world(shape: ElementTree.Element, where: str) -> NDArray[np.float64]:
-    """Transform of a shape, shape (4, 4): its operations one after the other."""
+    """Transform of a shape, shape (4, 4): the product of its operations."""
     transform = np.eye(4)
     for element in shape.findall("transform"):
         if element.get("name") not in ("to_world", "toWorld"):
@@ -176,7 +177,7 @@ def _operation(element: ElementTree.Element, where: str) -> NDArray[np.float64]:
         axis = _vector(element, where, missing=0.0)
         length = np.linalg.norm(axis)
         if not length > 0.0:
-            raise SceneError(f"{where} is rotated about no axis; give x, y or z a value in <rotate>")
+            raise SceneError(f"{where} has a rotation without an axis; give x, y or z a value in <rotate>")
         angle = np.deg2rad(_numbers(element.get("angle", ""), where, (1,))[0])
         out = rotation(axis, float(angle))
     elif element.tag == "matrix":

@@ -1,6 +1,6 @@
 """Wavefront OBJ: polygons in groups, with names of materials.
 
-Of a material only its name counts, and that is in the file itself; so the material files are asked for, and not read.
+Only the names of materials matter, and they are in the file itself. Material files are looked for but not read.
 """
 
 import re
@@ -17,19 +17,19 @@ from rayfix_offline.scene.text import decode
 from rayfix_tables.errors import SceneError
 
 FREE_FORM = ("cstype", "curv", "curv2", "surf", "bmat", "call", "csh")
-"""What is no polygon, or is in another file."""
+"""Keywords that are refused: free-form geometry, and geometry in other files."""
 
 PASSED_OVER = {"l": "line", "p": "point element"}
-"""What has no area."""
+"""Keywords of elements without an area."""
 
 IGNORED = frozenset(
     ("vt", "vn", "s", "mg", "lod", "bevel", "c_interp", "d_interp", "shadow_obj", "trace_obj", "maplib", "usemap")
 )
-"""How what is there looks."""
+"""Keywords of appearance."""
 
 
 def read_obj(path: Path) -> Contents:
-    """Read an OBJ file; each of its groups, or objects without groups, is an object.
+    """Read an OBJ file; each group, or each object without groups, becomes an object.
 
     Raises
     ------
@@ -100,7 +100,7 @@ class _Parser:
         try:
             self.vertices.append((float(words[0]), float(words[1]), float(words[2])))
         except (ValueError, IndexError):
-            self.refuse(f"'v {rest.strip()[:60]}' has no three numbers; export the scene again")
+            self.refuse(f"'v {rest.strip()[:60]}' does not have three numbers; export the scene again")
 
     def face(self, rest: str) -> None:
         count = len(self.vertices)
@@ -113,9 +113,9 @@ class _Parser:
                 # Negative ones count from the last vertex so far.
                 ring.append(number - 1 if number > 0 else count + number if number < 0 else -1)
         except ValueError:
-            self.refuse(f"'f {rest.strip()[:60]}' has what is no number of a vertex; export the scene again")
+            self.refuse(f"'f {rest.strip()[:60]}' has an invalid vertex index; export the scene again")
         if ring and min(ring) < 0:
-            self.refuse(f"'f {rest.strip()[:60]}' names a vertex that is not there; export the scene again")
+            self.refuse(f"'f {rest.strip()[:60]}' refers to a vertex that does not exist; export the scene again")
         if len(ring) < 3:
             self.passed["f"] = self.passed.get("f", 0) + 1
             return
@@ -132,7 +132,7 @@ class _Parser:
         self.enter(self.object)
 
     def begin_group(self, rest: str) -> None:
-        # Without a name, and as many exporters close a group: back to the object.
+        # An empty name, by which many exporters close a group: back to the object.
         name = " ".join(rest.split())
         plain = name in ("", "default", "off", "(null)")
         self.enter(self.object if plain else f"{self.object}/{name}" if self.object else name)
@@ -179,7 +179,7 @@ class _Parser:
         return Contents(objects=tuple(objects), remarks=remarks)
 
     def library_remarks(self) -> list[Remark]:
-        """Tell which material files are not there; a line names several, or one with blanks in its name."""
+        """Warn of missing material files; a line names several files, or one with blanks in its name."""
         folder = SceneFolder(self.path.parent, self.path.parent)
         missing = []
         for line in dict.fromkeys(self.libraries):
@@ -192,8 +192,8 @@ class _Parser:
         return [
             Remark(
                 kind="material file",
-                problem=f"the material file {names} is not there: materials have the names that the scene gives them",
-                remedy="nothing is lost if those are names of ITU-R P.2040; else export it too",
+                problem=f"the material file {names} is missing: materials have the names in the scene file",
+                remedy="no effect if those are names of ITU-R P.2040; otherwise export it too",
             )
         ]
 
@@ -210,6 +210,6 @@ class _Parser:
             named = ", ".join(f"'{word[:30]}'" for word in list(unknown)[:4])
             number = sum(unknown.values())
             begin = "that begins" if number == 1 else "that begin"
-            problem = f"{counted(number, 'line')} of the file {begin} with {named} left out, as not understood"
+            problem = f"{counted(number, 'line')} of the file {begin} with {named} left out, because they are unknown"
             remarks.append(Remark(kind="left out", problem=problem, remedy="export the scene again"))
         return remarks

@@ -33,7 +33,7 @@ class _Property:
     name: str
     kind: str
     length_kind: str = ""
-    """Of a list, the type of its length."""
+    """Type of a list's length."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ def read_ply(path: Path) -> Contents:
     Raises
     ------
     SceneError
-        When the file is none, is shorter or longer than its header says, or names vertices that are not there.
+        When the file is not PLY, is shorter or longer than its header states, or refers to missing vertices.
     """
     content = path.read_bytes()
     order, elements, start = _header(path, content)
@@ -69,7 +69,7 @@ def read_ply(path: Path) -> Contents:
     strips = _strips(path, columns.get("tristrips", {}))
     used = np.concatenate([corners, strips.reshape(-1)])
     if len(used) and not (used.min() >= 0 and used.max() < len(vertices)):
-        _refuse(path, f"it has a face of a vertex that is not there, among {len(vertices):,}")
+        _refuse(path, f"it has a face with a vertex beyond its {len(vertices):,} vertices")
     if (sizes < 3).any():
         kept = np.repeat(sizes >= 3, sizes)
         corners = corners[kept]
@@ -162,7 +162,7 @@ def _binary(path: Path, elements: list[_Element], data: bytes, order: str) -> di
             columns, at = _one_by_one(path, element, data, at, order)
         found[element.name] = columns
     if data[at:].strip(b"\0\r\n\t "):
-        _refuse(path, f"it has {len(data) - at:,} bytes more than its header tells")
+        _refuse(path, f"it has {len(data) - at:,} bytes more than its header states")
     return found
 
 
@@ -249,7 +249,7 @@ def _words(path: Path, elements: list[_Element], words: list[str]) -> dict[str, 
     except ValueError as error:
         _refuse(path, f"element '{element.name}': {str(error)[:80]}")
     if at < len(words):
-        _refuse(path, f"it has {len(words) - at:,} numbers more than its header tells")
+        _refuse(path, f"it has {len(words) - at:,} numbers more than its header states")
     return found
 
 
@@ -264,7 +264,7 @@ def _polygons(path: Path, face: dict[str, _Column]) -> tuple[NDArray[np.int64], 
 
 
 def _strips(path: Path, strips: dict[str, _Column]) -> NDArray[np.int64]:
-    """Triangles of strips, which -1 parts; every other one is turned."""
+    """Triangles of strips, which -1 separates; every other triangle is flipped."""
     if not strips:
         return np.zeros((0, 3), np.int64)
     column = next((strips[name] for name in LISTS if name in strips), None)
@@ -279,7 +279,7 @@ def _strips(path: Path, strips: dict[str, _Column]) -> NDArray[np.int64]:
 
 
 def strip_triangles(strip: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Triangles of a strip of corners, shape (n, 3), all facing as the first."""
+    """Triangles of a strip of corners, shape (n, 3), oriented like the first."""
     if len(strip) < 3:
         return np.zeros((0, 3), np.int64)
     faces = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)

@@ -13,10 +13,10 @@ from rayfix_offline.scene.text import decode
 from rayfix_tables.errors import SceneError
 
 HEADER, RECORD = 84, 50
-"""Bytes of a binary file's head, with the count, and of a triangle."""
+"""Bytes of a binary file's header, count included, and of a triangle."""
 
 NO_COUNT = (0, 2**32 - 1)
-"""What programs write that do not know the count beforehand."""
+"""Counts that programs write if they do not know the number in advance."""
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
@@ -27,7 +27,7 @@ def read_stl(path: Path) -> Contents:
     Raises
     ------
     SceneError
-        When the file is none, or ends before its last triangle.
+        When the file is not STL, or ends before its last triangle.
     """
     content = path.read_bytes()
     if not _is_binary(content):
@@ -40,15 +40,15 @@ def read_stl(path: Path) -> Contents:
     if rest and (said in NO_COUNT or said > count):
         _refuse(path, f"it ends within a triangle, after {count:,}")
     if said > count and said not in NO_COUNT:
-        _refuse(path, f"it says that it has {counted(said, 'triangle')}, and ends after {count:,}")
+        _refuse(path, f"it states {counted(said, 'triangle')}, and ends after {count:,}")
     if rest:
         count = said
-        problem = f"the file goes on after its {counted(said, 'triangle')}, with bytes that are not read"
+        problem = f"the file continues after its {counted(said, 'triangle')}, with bytes that are not read"
         remarks.append(
             Remark(kind="count", problem=problem, remedy="export the scene again, and see that all is there")
         )
     elif said != count:
-        problem = f"the file says that it has {counted(said, 'triangle')}, and has {count:,}: all of these are read"
+        problem = f"the file states {counted(said, 'triangle')}, and has {count:,}: all of these are read"
         remarks.append(
             Remark(kind="count", problem=problem, remedy="export the scene again, and see that all is there")
         )
@@ -70,7 +70,7 @@ def _text(path: Path, content: bytes) -> Contents:
     try:
         text = decode(content)
     except UnicodeDecodeError:
-        _refuse(path, "it is no text in the encoding that its byte order mark names")
+        _refuse(path, "it is not text in the encoding of its byte order mark")
     points: list[str] = []
     sizes: list[int] = []
     state = "solid"
@@ -105,7 +105,7 @@ def _text(path: Path, content: bytes) -> Contents:
     remarks = []
     if ended < begun:
         problem = f"the file ends without 'endsolid', after {counted(len(sizes), 'triangle')}"
-        remarks.append(Remark(kind="count", problem=problem, remedy="see that all is there, or export it again"))
+        remarks.append(Remark(kind="count", problem=problem, remedy="check that it is complete, or export it again"))
     if len(sizes) and min(sizes) < 3:
         _refuse(path, "it has a triangle of fewer than three corners")
     counts = np.array(sizes, np.int64)

@@ -1,4 +1,4 @@
-"""Limits of XML files, checked by a parser that keeps nothing before one that keeps all reads them."""
+"""Limits of XML files, checked by a streaming parser before the tree is built."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -9,30 +9,30 @@ import numpy as np
 from rayfix_tables.errors import SceneError
 
 MOST_NESTED = 200
-"""Elements in each other; exporters write some ten, and readers call themselves for each."""
+"""Largest depth of nested elements; exporters write about ten, and readers recurse."""
 
 MOST_INSTANCED = 200_000_000
-"""Characters of triangles' indices that a COLLADA file's instances may come to, unless the file itself is longer."""
+"""Limit of the characters of triangle indices of all instances of a COLLADA file, unless the file itself is longer."""
 
 
 def refuse_hostile_xml(path: Path, content: bytes, encoding: str | None = None) -> None:
-    """Refuse what makes a short file long, names other files or exhausts a reader's stack.
+    """Refuse content that expands a short file, reads other files or exhausts a reader's stack.
 
     Parameters
     ----------
     encoding : str, optional
-        Whatever the file declares.
+        Encoding that overrides the file's declaration.
 
     Raises
     ------
     SceneError
-        When the file is no XML, declares a document type or entities, or nests its elements too deeply.
+        When the file is not XML, declares a document type or entities, or nests its elements too deeply.
     """
     parser = expat.ParserCreate(encoding)
     depth = 0
 
     def declared(*_: object) -> None:
-        # Entities can grow without bound and name other files; no exporter writes them.
+        # Entities can expand without bound and read other files; no exporter writes them.
         raise SceneError(f"{path} declares a document type or entities, which is not allowed; remove <!DOCTYPE ...>")
 
     def begun(*_: object) -> None:
@@ -59,7 +59,7 @@ def refuse_hostile_xml(path: Path, content: bytes, encoding: str | None = None) 
 
 
 def refuse_hostile_collada(path: Path, content: bytes) -> None:
-    """Refuse numbers that a COLLADA file's reader changes, and instances that make a short file a huge scene.
+    """Refuse numbers that the COLLADA reader would change, and instances that expand a short file to a huge scene.
 
     The content has passed :func:`refuse_hostile_xml`.
 
@@ -67,7 +67,7 @@ def refuse_hostile_collada(path: Path, content: bytes) -> None:
     ------
     SceneError
         When the file has numbers that are not finite in single precision, when its nodes instantiate each other in a
-        circle, or when its instances come to too much.
+        cycle, or when its instances exceed the limit.
     """
     root = ElementTree.fromstring(content)
     _refuse_infinite(path, root)
@@ -75,8 +75,8 @@ def refuse_hostile_collada(path: Path, content: bytes) -> None:
 
 
 def _refuse_infinite(path: Path, root: ElementTree.Element) -> None:
-    # The reader takes NaN for 0, and leaves out triangles whose corners are infinite in single precision. Only
-    # positions count: exporters write normals of NaN.
+    # The reader converts NaN to 0, and leaves out triangles with corners that are infinite in single precision. Only
+    # positions are checked: exporters write normals of NaN.
     inputs = [element for element in root.iter() if kind_of(element) == "input"]
     positions = {each.get("source", "")[1:] for each in inputs if each.get("semantic") == "POSITION"}
     sources = [element for element in root.iter() if kind_of(element) == "source" and element.get("id") in positions]
@@ -85,7 +85,7 @@ def _refuse_infinite(path: Path, root: ElementTree.Element) -> None:
         try:
             numbers = np.array(words, np.float64)
         except ValueError:
-            continue  # that is for the reader to tell
+            continue  # the reader reports this
         wrong = np.flatnonzero(~(np.abs(numbers) <= np.finfo(np.float32).max))
         if len(wrong):
             raise SceneError(
@@ -105,7 +105,7 @@ def _refuse_multiplied(path: Path, root: ElementTree.Element, limit: int) -> Non
     known: dict[str, tuple[int, int]] = {}
 
     def measure(element: ElementTree.Element, depth: int) -> tuple[int, int]:
-        """Give the characters that an element comes to, and how deep its instances nest."""
+        """Return the number of characters that an element expands to, and the depth of its instances."""
         name = element.get("id", "") if kind_of(element) == "node" else ""
         if name in known:
             return known[name]
@@ -133,7 +133,7 @@ def _refuse_multiplied(path: Path, root: ElementTree.Element, limit: int) -> Non
                 )
         if size > limit:
             raise SceneError(
-                f"{path} instantiates its geometries so often that they come to {size:,} characters of indices, more "
+                f"{path} instantiates its geometries so often that they expand to {size:,} characters of indices, more "
                 f"than {limit:,}; export the scene in parts"
             )
         if name:

@@ -38,7 +38,7 @@ Answer = Callable[[Adapted], Awaitable[dict[str, Any]]]
 
 
 def check_settings(settings: MqttSettings) -> None:
-    """Check what a broker would refuse or what would loop.
+    """Refuse topics that a broker does not accept, and topics by which positions would be read as angles.
 
     Raises
     ------
@@ -59,13 +59,13 @@ def check_settings(settings: MqttSettings) -> None:
     try:
         loops = aiomqtt.Topic(topic).matches(settings.topic)
     except ValueError:
-        raise BrokerError(f"topic {settings.topic!r} is no topic filter; give e.g. silabs/aoa/angle/+/+") from None
+        raise BrokerError(f"topic {settings.topic!r} is not a topic filter; give e.g. silabs/aoa/angle/+/+") from None
     if loops:
         raise BrokerError(f"topic {settings.publish!r} is among those read, {settings.topic!r}; give another")
 
 
 def topic_for(publish: str, target_id: str) -> str:
-    """Write the topic of a target's positions; its name is one level of it, whatever it holds.
+    """Write the topic of a target's positions; the escaped name is one level of the topic.
 
     Raises
     ------
@@ -105,7 +105,7 @@ async def run_mqtt(
     broker : Broker
     settings : MqttSettings
     on_ready : callable, optional
-        Called each time that the topics are subscribed to.
+        Called after each subscription.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def _client(broker: Broker) -> aiomqtt.Client:
 
 
 async def _first_of(*coroutines: Coroutine[Any, Any, None]) -> None:
-    """Run coroutines until the first ends, as a rule with an exception, and cancel the others."""
+    """Run coroutines until the first one ends, normally with an exception, and cancel the others."""
     tasks = [asyncio.create_task(coroutine) for coroutine in coroutines]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -227,14 +227,14 @@ class MqttSession:
             pause = min(2.0 * pause, _LONGEST_PAUSE)
 
     def summary(self) -> str:
-        """Count what gave no position, in words."""
+        """Describe how many messages and packets gave no position."""
         return (
             f"{self.stream.num_passed_over} messages passed over, {self.stream.num_repeated} delivered twice; "
             f"{self.failed['no position']} packets without a position, {self.failed['defect']} that failed"
         )
 
     async def read(self, client: aiomqtt.Client) -> None:
-        """Take all messages; one that cannot be read is skipped."""
+        """Process all messages; a message that cannot be read is skipped."""
         async for message in client.messages:
             if isinstance(message.payload, bytes):
                 await self._publish(client, self._receive(message.topic.value, message.payload))
@@ -258,7 +258,7 @@ class MqttSession:
         return reports
 
     async def watch(self, client: aiomqtt.Client) -> None:
-        """Complete packets that not all locators have received."""
+        """Locate packets whose window has passed, though some locators have not received them."""
         while True:
             await asyncio.sleep(0.1 * self.settings.window)
             await self._publish(client, self.stream.due(monotonic()))

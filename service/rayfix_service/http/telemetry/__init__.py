@@ -1,1 +1,1 @@
-"""Metrics, logs and the identity of each request."""
+"""Metrics, logs and request identifiers."""

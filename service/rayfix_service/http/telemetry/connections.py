@@ -1,4 +1,4 @@
-"""The connections of one worker: how many there are, which of them wait, and why some were closed."""
+"""The connections of one worker: their number, which of them are idle, and why the service closed some."""
 
 import asyncio
 import logging
@@ -9,12 +9,12 @@ from typing import Literal, Protocol, get_args
 from rayfix_service.http.settings import ConnectionLimits
 
 Closed = Literal["malformed", "head_too_large", "head_too_slow", "body_too_slow", "unread", "full"]
-"""Why the service closed a connection by itself."""
+"""Reason why the service closed a connection."""
 
 CLOSED: tuple[Closed, ...] = get_args(Closed)
 
 NOTE = "rayfix.connection_closed"
-"""Key of the lifespan's state: what to call with each :data:`Closed`."""
+"""Key in the lifespan's state of the function that is called with each :data:`Closed`."""
 
 _SPARE = 32
 _TELL_SECONDS = 10.0
@@ -32,17 +32,17 @@ _log = logging.getLogger(__name__)
 
 
 class Droppable(Protocol):
-    """A connection that may be closed for another."""
+    """A connection that may be closed to make room for another."""
 
     def drop(self) -> None:
         """Close it at once."""
 
 
 class Crowd:
-    """Keeps the connections of one worker within their number.
+    """Limits the number of connections of one worker.
 
-    A connection above the limit replaces the one that has waited longest for a request. Where none waits, a few more
-    are accepted, so that health checks get an answer.
+    A connection above the limit replaces the one that has been idle longest. If none is idle, a few more connections
+    are accepted to answer health checks.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Crowd:
         self._told_at = -_TELL_SECONDS
 
     def enter(self, connection: Droppable, count: int) -> bool:
-        """Accept a connection, the ``count``-th; return whether it is above the limit and none was closed for it."""
+        """Accept the ``count``-th connection; return whether it is above the limit and no other was closed for it."""
         if count - len(self._spare) > self.limits.connections:
             if self._waiting:
                 self._drop_oldest(self._waiting)
@@ -70,30 +70,30 @@ class Crowd:
         return False
 
     def wait(self, connection: Droppable) -> None:
-        """Note that a connection waits for a request."""
+        """Record that a connection waits for a request."""
         if connection not in self._spare:
             self._waiting[connection] = None
 
     def work(self, connection: Droppable) -> None:
-        """Note that a connection has a request."""
+        """Record that a connection has a request."""
         self._waiting.pop(connection, None)
 
     def leave(self, connection: Droppable) -> None:
-        """Note that a connection has ended, or is no longer for requests."""
+        """Record that a connection has ended or has become a web socket."""
         self._waiting.pop(connection, None)
         self._spare.pop(connection, None)
 
     def note(self, reason: Closed, figure: Callable[[Closed], None] | None) -> None:
-        """Count a connection that the service closed; the log has a line for many."""
+        """Count a connection that the service closed; the log gets one line for many of them."""
         if figure is not None:
             figure(reason)
         self._untold[reason] = self._untold.get(reason, 0) + 1
         now = monotonic()
         if now - self._told_at >= _TELL_SECONDS:
             self._told_at = now
-            asyncio.get_running_loop().call_later(0.5, self._tell)
+            asyncio.get_running_loop().call_later(0.5, self._log_counts)
 
-    def _tell(self) -> None:
+    def _log_counts(self) -> None:
         told, self._untold = self._untold, {}
         for reason, number in told.items():
             _log.warning("%d connection%s closed: %s", number, "" if number == 1 else "s", _REASONS[reason])

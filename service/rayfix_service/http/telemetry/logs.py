@@ -1,4 +1,4 @@
-"""Logs, as text or as JSON, one record a line."""
+"""Log formats: text or JSON, one record per line."""
 
 import copy
 import json
@@ -16,12 +16,12 @@ LogFormat = Literal["text", "json"]
 
 _TEXT = "%(asctime)s %(levelprefix)s %(message)s"
 
-# Control characters, among them escape sequences of terminals, and what ends a line or turns its direction.
+# Control characters, which include terminal escape sequences, line separators and bidirectional controls.
 _UNFIT = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def on_one_line(text: str) -> str:
-    """Write what is unfit for a line of a log as Python's escapes."""
+    """Replace characters that could forge or break a log line by Python escapes."""
     return _UNFIT.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
@@ -45,10 +45,10 @@ class TextFormatter(DefaultFormatter):
 
 
 class JsonFormatter(logging.Formatter):
-    """Writes a record as one line of JSON.
+    """Formats a record as one line of JSON.
 
-    Keys are ``time`` (UTC), ``level``, ``logger``, ``message``, within a request ``request_id``, of an exception
-    ``exception``, and what the record has in ``fields``.
+    Keys are ``time`` (UTC), ``level``, ``logger`` and ``message``; ``request_id`` within a request; ``exception`` with
+    the traceback; and the keys of the record's ``fields``.
     """
 
     def format(self, record: logging.LogRecord) -> str:

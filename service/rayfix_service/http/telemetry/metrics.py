@@ -1,4 +1,4 @@
-"""Figures for Prometheus; docs/operations.md lists them."""
+"""Prometheus metrics; docs/operations.md lists them."""
 
 import os
 import re
@@ -22,14 +22,14 @@ from rayfix_tables.site import SiteInfo
 from rayfix_tables.table import Table
 
 MULTIPROCESS_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
-"""Environment variable of prometheus-client: folder for the figures of several processes."""
+"""Environment variable of prometheus-client: folder for the metrics of several processes."""
 
 _ACCEPTABLE = re.compile(
     r"[ \t]*[a-z*]+/[a-z*.+-]+"
     r"(?:[ \t]*;[ \t]*(?:version=\d{1,4}(?:\.\d{1,4}){0,2}|(?:escaping|charset|q)=[a-z0-9.-]+))*[ \t]*",
     re.ASCII | re.IGNORECASE,
 )
-"""An item of an Accept header that prometheus-client can read; it fails at others."""
+"""An item of an Accept header that prometheus-client can parse; it raises an exception at others."""
 
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 
@@ -62,7 +62,7 @@ class Metrics:
             registry=self._registry,
         )
         fixes = Counter("rayfix_fixes", "Fixes by status", ("status",), registry=self._registry)
-        # All that there can be is there from the start, at 0, so that a rate begins with the first.
+        # All label values exist from the start with 0; otherwise a rate would miss the first event.
         self._fixes = {status: fixes.labels(status) for status in get_args(Status)}
         self._fusion_seconds = Histogram(
             "rayfix_fusion_seconds", "Time that a fix took to compute", buckets=SECONDS, registry=self._registry
@@ -137,7 +137,7 @@ class Metrics:
         """Count a request."""
         method = method if method in _METHODS else "other"
         kind = (route, method, status)
-        if (figures := self._by_request.get(kind)) is None:  # to find them by their labels takes a lock for each
+        if (figures := self._by_request.get(kind)) is None:  # looking them up by labels takes a lock for each
             figures = self._requests.labels(*kind), self._request_seconds.labels(route, method)
             self._by_request[kind] = figures
         requests, request_seconds = figures
@@ -186,29 +186,29 @@ class Metrics:
         self._closed[reason].inc()
 
     def table_loaded(self, name: str, table: Table) -> None:
-        """Tell that a table answers."""
+        """Record that a table is served."""
         self._table.labels(*_table_labels(name, table)).set(1)
         self._loads["loaded"].inc()
         self._stations.add_table(name, table.site)
 
     def table_left(self, name: str, table: Table) -> None:
-        """Tell that a table does no longer answer."""
+        """Record that a table is no longer served."""
         self._table.labels(*_table_labels(name, table)).set(0)
 
     def table_refused(self) -> None:
-        """Tell that a table did not pass its check."""
+        """Count a table that did not pass its check."""
         self._loads["refused"].inc()
 
     def tables_refused(self, count: int) -> None:
-        """Tell how many files are refused as they are now."""
+        """Set the number of files that are refused at present."""
         self._refused.set(count)
 
     def became_ready(self) -> None:
-        """Tell that the service can locate."""
+        """Record that the service can locate."""
         self._ready.set(1)
 
     def exposition(self, accept: str) -> tuple[bytes, str]:
-        """Write all figures, those of the other worker processes included; returns text and media type.
+        """Export all metrics, including those of the other worker processes; returns text and media type.
 
         Parameters
         ----------
@@ -238,7 +238,7 @@ def _table_labels(name: str, table: Table) -> tuple[str, ...]:
 
 
 def share_figures() -> None:
-    """Keep figures that are created from now on in files of this process, in the folder of ``MULTIPROCESS_VARIABLE``.
+    """Keep metrics that are created from now on in files of this process, in the folder of ``MULTIPROCESS_VARIABLE``.
 
     prometheus-client reads the variable when it is imported, which is before there are workers. Where the folder has no
     room or is gone, the figures of this process are in its memory, and a warning says so.
@@ -254,7 +254,7 @@ def forget_dead_workers() -> None:
         return
     for path in Path(folder).glob("gauge_live*.db"):
         pid = path.stem.rpartition("_")[2]
-        # Not by mark_process_dead, which fails where another worker removes the same file at the same time.
+        # mark_process_dead would fail when another worker removes the same file at the same time.
         if pid.isdecimal() and not _is_alive(int(pid)):
             path.unlink(missing_ok=True)
 
@@ -264,6 +264,6 @@ def _is_alive(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # alive, and another user's
+    except PermissionError:  # it is alive and belongs to another user
         pass
     return True

@@ -1,4 +1,4 @@
-"""What surrounds every request: its identifier, its log line and figures, and an answer to every error."""
+"""Middleware around every request: identifier, log line, metrics, and a response to every unhandled exception."""
 
 import asyncio
 import logging
@@ -20,10 +20,10 @@ HEADER = "X-Request-ID"
 _RAW_HEADER = HEADER.lower().encode()
 
 REQUEST_ID: ContextVar[str | None] = ContextVar("REQUEST_ID", default=None)
-"""Identifier of the request under way."""
+"""Identifier of the current request."""
 
 ACCESS_LOGGER = "rayfix_service.access"
-"""Logger of a line per request; silent unless its level is INFO."""
+"""Logger of one line per request, at level INFO."""
 
 _access = logging.getLogger(ACCESS_LOGGER)
 _log = logging.getLogger(__name__)
@@ -34,9 +34,10 @@ _PROPER = re.compile(r"[A-Za-z0-9._:/+=-]{1,128}")
 class RequestContext:
     """Middleware around all others.
 
-    It gives each request an identifier, the client's own if it sent a proper one, and echoes it; counts the request and
-    logs it; and logs an exception that nobody handled, once, with a problem for answer unless there is one. Starlette
-    answers those of routes by the handler for Exception and raises them again; the server would log them then.
+    It gives each request an identifier and returns it in a header; a valid identifier from the client is used. It
+    counts and logs the request. An unhandled exception is logged once and answered with a problem document unless a
+    response has begun. Starlette answers exceptions of routes with the handler for Exception and raises them again; the
+    server would log them a second time.
     """
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
@@ -46,7 +47,7 @@ class RequestContext:
         self._prefix = token_hex(10)  # of this process: a random number for each request costs a system call
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request, or one handshake of a web socket and what follows."""
+        """Serve one request, or one web socket from its handshake to its end."""
         if scope["type"] == "websocket":
             await self._serve_socket(scope, receive, send)
             return
@@ -69,7 +70,7 @@ class RequestContext:
         start = perf_counter()
         try:
             await self._app(scope, receive, send_noting)
-        except asyncio.CancelledError:  # the process ends, or the client's key was taken out: no defect
+        except asyncio.CancelledError:  # not a defect: the process ends, or the client's key was removed
             if not answered:
                 _log.warning("request %s %s cut off", scope["method"], _one_word(scope["path"]))
             if not status:
@@ -101,7 +102,7 @@ class RequestContext:
                 message["headers"] = [*message.get("headers", ()), (_RAW_HEADER, identifier.encode())]
                 note("101" if kind == "websocket.accept" else str(message["status"]))
             elif kind == "websocket.close":
-                note("403")  # what the server makes of it before the handshake
+                note("403")  # the server's status for a close before the handshake
             await send(message)
 
         token = REQUEST_ID.set(identifier)
@@ -114,15 +115,16 @@ class RequestContext:
             REQUEST_ID.reset(token)
 
     def _identifier(self, scope: Scope) -> str:
-        """Take the client's identifier where it is fit for a log, else make one."""
+        """Use the client's identifier if it is safe in a log; otherwise make one."""
         given = header(scope, _RAW_HEADER)
         if given is not None and _PROPER.fullmatch(given):
             return given
         return f"{self._prefix}{next(self._numbers):012x}"
 
     def _note(self, scope: Scope, method: str, status: str, seconds: float, identifier: str) -> None:
-        """Count a request, and log it if that is wanted; the status is "none" where the client left before it."""
-        # Only the route's template: the path is the client's, and a figure for each would be without end.
+        """Count a request and log it if enabled; the status is "none" if the client left before a response."""
+        # The label is the route's template: with paths, which clients choose, the number of time series would be
+        # unbounded.
         route = getattr(scope.get("route"), "path", "none")
         self._metrics.request_done(route, method, status, seconds)
         if _access.isEnabledFor(logging.INFO):
@@ -133,7 +135,7 @@ class RequestContext:
 
 
 def _one_word(text: str) -> str:
-    """Write a path so that it is one word of a line: what else follows in it cannot be the client's."""
+    """Quote a path to make it one word, so a client cannot add words to the line."""
     return quote(text, safe="/:@!$&'()*+,;=~", errors="replace")
 
 

@@ -80,7 +80,7 @@ def test_materials_are_bound_where_a_geometry_is_shown(tmp_path: Path) -> None:
     assert found == {("m1", "itu_concrete"), ("m2", "itu_wood"), ("m1", "itu_brick"), ("m2", "itu_brick")}
     assert scene.remarks == ()
     scene = load(document(geometry("wall", SOURCE + surfaces), nodes), tmp_path)
-    assert "material '#m1' is not there: 'face' is taken" in scene.remarks[0].problem
+    assert "material '#m1' is missing: 'face' is used" in scene.remarks[0].problem
 
 
 def test_transforms_one_after_the_other(tmp_path: Path) -> None:
@@ -89,7 +89,9 @@ def test_transforms_one_after_the_other(tmp_path: Path) -> None:
     node = f'<node><matrix>1 0 0 0 0 1 0 0 0 0 1 5 0 0 0 1</matrix><node id="n">{inner}{{}}</node></node>'
     scene = load(document(WALL, node.format('<instance_geometry url="#wall"/>')), tmp_path)
     np.testing.assert_allclose(scene.bounds, [(-5, 4.9, 5), (1, 5.1, 11)], rtol=0, atol=1e-12)
-    assert "has not 3 numbers" in refused(document(WALL, NODE.replace("><", "><scale>1 1</scale><", 1)), tmp_path)
+    assert "without exactly 3 numbers" in refused(
+        document(WALL, NODE.replace("><", "><scale>1 1</scale><", 1)), tmp_path
+    )
 
 
 def test_nodes_of_the_library_and_one_id_for_scene_node_and_geometry(tmp_path: Path) -> None:
@@ -113,7 +115,7 @@ def test_a_skin_is_read_in_its_rest_pose(tmp_path: Path) -> None:
     assert len(scene.faces) == 28
     assert "bent by a controller" in scene.remarks[0].problem
     more = more.replace("#wall", "#none")
-    assert "'#none', which is not there" in refused(
+    assert "'#none', which is missing" in refused(
         document(WALL, '<node><instance_controller url="#c"/></node>', more=more), tmp_path
     )
 
@@ -129,16 +131,16 @@ def test_counts_that_are_not_the_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "told"),
     [
-        ('source="#wall-v"', 'source="#none"', "the vertices '#none', which is not there"),
-        ('source="#wall-p"', 'source="#none"', "the source '#none', which is not there"),
-        ('source="#wall-pa"', 'source="#none"', "the float_array '#none', which is not there"),
-        ('url="#wall"', 'url="#none"', "the geometry '#none', which is not there"),
+        ('source="#wall-v"', 'source="#none"', "the vertices '#none', which is missing"),
+        ('source="#wall-p"', 'source="#none"', "the source '#none', which is missing"),
+        ('source="#wall-pa"', 'source="#none"', "the float_array '#none', which is missing"),
+        ('url="#wall"', 'url="#none"', "the geometry '#none', which is missing"),
         ('url="#wall"', 'url="b.dae#wall"', "'b.dae#wall', which is in another file"),
-        ('url="#scene"', 'url="#none"', "the visual_scene '#none', which is not there"),
-        ('count="16" stride="3"', 'count="17" stride="3"', "48 numbers, fewer than its accessor tells"),
+        ('url="#scene"', 'url="#none"', "the visual_scene '#none', which is missing"),
+        ('count="16" stride="3"', 'count="17" stride="3"', "48 numbers, fewer than its accessor states"),
         ('stride="3"', 'stride="2"', "has no X, Y and Z"),
         ("<p>", "<p>9 ", "49 corners"),
-        ("<p>7 ", "<p>99 ", "a vertex that is not there, among 16"),
+        ("<p>7 ", "<p>99 ", "a vertex beyond its 16"),
         ("<p>7 ", "<p>x ", "invalid literal"),
         ('meter="1"', 'meter="0"', "its unit is 0 m"),
         ("<mesh>", "<convex_mesh>", "is a <convex_mesh>"),

@@ -232,7 +232,7 @@ def test_what_the_scene_does_not_show_is_told(tmp_path: Path) -> None:
     assert len(scene.faces) == 12
     for expected in (
         "points or lines",
-        "bent by a skin",
+        "deformed by a skin",
         "1 node with a mesh left out, such as 'spare'",
         "a mesh left out",
     ):
@@ -253,17 +253,17 @@ def test_names_with_blanks(name: str, tmp_path: Path) -> None:
     [
         ("accessors", "count", 9, "accessors[0] goes beyond bufferViews[0]"),
         ("accessors", "count", -1, "accessors[0].count is -1"),
-        ("accessors", "bufferView", 7, "bufferViews[7], which is not there"),
-        ("accessors", "componentType", 5130, "accessors[0] is no 3-vector"),
-        ("accessors", "type", "VEC2", "accessors[0] is no 3-vector"),
+        ("accessors", "bufferView", 7, "bufferViews[7], which does not exist"),
+        ("accessors", "componentType", 5130, "accessors[0] is not a 3-vector"),
+        ("accessors", "type", "VEC2", "accessors[0] is not a 3-vector"),
         ("bufferViews", "byteLength", 10_000, "bufferViews[0] goes beyond buffers[0]"),
         ("bufferViews", "byteStride", 4, "byteStride is 4"),
-        ("nodes", "mesh", 3, "meshes[3], which is not there"),
-        ("nodes", "children", [5], "nodes[5], which is not there"),
-        ("nodes", "scale", [1, 2], "scale has not 3 numbers"),
+        ("nodes", "mesh", 3, "meshes[3], which does not exist"),
+        ("nodes", "children", [5], "nodes[5], which does not exist"),
+        ("nodes", "scale", [1, 2], "scale does not have 3 numbers"),
         ("meshes", "primitives", [{"attributes": {}}], "has no positions"),
         ("meshes", "primitives", [{"attributes": {"POSITION": 0}, "mode": 9}], "mode 9"),
-        ("meshes", "primitives", [{"attributes": {"POSITION": 0}}], "8 indices, which are no triangles"),
+        ("meshes", "primitives", [{"attributes": {"POSITION": 0}}], "8 indices, not a multiple of 3"),
         ("meshes", "primitives", 5, "an entry is of a wrong type"),
     ],
 )
@@ -276,7 +276,7 @@ def test_what_is_wrong_is_refused_by_name(entry: str, key: str, value: Any, told
 def test_indices_beyond_the_positions(tmp_path: Path) -> None:
     file = one_box()
     file.document["accessors"][1]["bufferView"] = file.view(np.full(36, 8, np.uint16).tobytes())
-    assert "a triangle of position 8, among 8" in refusal(SceneError, load_scene, file.write(tmp_path / "a.glb"))
+    assert "the index 8, beyond its 8" in refusal(SceneError, load_scene, file.write(tmp_path / "a.glb"))
 
 
 def test_version_1_is_refused(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def test_polygons_of_different_size(form: str, list_name: str, tmp_path: Path) -
 def test_a_wrong_number_of_faces_is_refused(number: int, form: str, tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(ply_of(form, number=number))
     message = refusal(SceneError, load_scene, tmp_path / "a.ply")
-    assert ("more than its header tells" in message) == (number < 10)
+    assert ("more than its header states" in message) == (number < 10)
     assert ("it ends within" in message) == (number > 10)
 
 
@@ -72,7 +72,7 @@ def test_strips_of_triangles(tmp_path: Path) -> None:
 def test_indices_beyond_the_vertices_are_refused(tmp_path: Path) -> None:
     text = ply_of("ascii").decode().replace("4 0 ", "4 99 ", 1).replace("8 0 ", "8 99 ", 1)
     (tmp_path / "a.ply").write_text(text)
-    assert "a vertex that is not there" in refusal(SceneError, load_scene, tmp_path / "a.ply")
+    assert "a vertex beyond its" in refusal(SceneError, load_scene, tmp_path / "a.ply")
 
 
 TRIANGLES = np.array(
@@ -95,14 +95,14 @@ def test_all_triangles_are_read_when_the_file_says_fewer(said: int, tmp_path: Pa
 
 def test_a_file_that_says_more_triangles_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.stl").write_bytes(stl_of(4))
-    assert "says that it has 4 triangles, and ends after 3" in refusal(SceneError, load_scene, tmp_path / "a.stl")
+    assert "states 4 triangles, and ends after 3" in refusal(SceneError, load_scene, tmp_path / "a.stl")
 
 
 def test_what_follows_the_triangles_is_told_of(tmp_path: Path) -> None:
     (tmp_path / "a.stl").write_bytes(stl_of(3, head=b"solid \xe4", tail=b"note"))
     scene = load_scene(tmp_path / "a.stl")
     assert len(scene.faces) == 3
-    assert "goes on after its 3 triangles" in scene.remarks[0].problem
+    assert "continues after its 3 triangles" in scene.remarks[0].problem
 
 
 def stl_text(*, ends: bool = True) -> str:
