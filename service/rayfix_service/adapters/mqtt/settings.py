@@ -106,5 +106,5 @@ def parse_broker(text: str, *, tls: bool = False, username: str | None = None, p
     except ValueError:
         host, port = None, None
     if not host or parts.path or parts.query or parts.fragment or "@" in text:
-        raise BrokerError(f"broker {text!r} is no address; give HOST or HOST:PORT, e.g. localhost:1883")
+        raise BrokerError(f"broker {text!r} is not an address; give HOST or HOST:PORT, e.g. localhost:1883")
     return Broker(host=host, port=port or (8883 if tls else 1883), username=username, password=password, tls=tls)
