@@ -90,7 +90,7 @@ def web_prefix(text: str) -> str:
 
     prefix = text.rstrip("/")
     if prefix and not is_prefix(prefix):  # argparse also reads the default, which is empty
-        raise argparse.ArgumentTypeError(f"{text!r} is no path of plain segments; give e.g. /rayfix")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a plain path; give e.g. /rayfix")
     return prefix
 
 
