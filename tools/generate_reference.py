@@ -155,7 +155,11 @@ def command_page() -> str:
     lines = [COMMAND_HEAD.rstrip()]
     lines += [f"| [`rayfix {name}`](#rayfix-{name}) | {helps[name]} |" for name in commands.choices]
     for name, command in commands.choices.items():
-        lines += [f"\n## rayfix {name}\n", f"{helps[name][0].upper()}{helps[name][1:]}.\n", f"    {_usage(command)}\n"]
+        lines += [
+            f"\n## rayfix {name}\n",
+            f"{helps[name][0].upper()}{helps[name][1:]}.\n",
+            f"```text\n{_usage(command)}\n```\n",
+        ]
         lines += ["| argument | meaning |", "|---|---|"]
         lines += [f"| {form} | {text} |" for form, text in _arguments(command)]
     return "\n".join(lines) + "\n"

@@ -241,7 +241,7 @@ def test_the_estimate_is_hardly_below_the_time(locator: Locator) -> None:
         if estimate > ServiceSettings.quick_fix_seconds:
             raise ReportError("slow")
         begin = time.thread_time()
-        locator.locate(report)
+        locator.fuse(report)
         factors.append((time.thread_time() - begin) / estimate)
         return factors[-1]
 
@@ -370,9 +370,9 @@ def test_the_search_for_a_cause_has_what_the_fix_has_left_of_its_time(
     """Each had a whole limit, and an answer took up to two."""
     fuse, searched = Locator.fuse, []
 
-    def slow_fuse(self: Locator, report: Report, *, stop: Stop) -> Fused:
+    def slow_fuse(self: Locator, report: Report, *, stop: Stop, with_likelihood: bool) -> Fused:
         time.sleep(2.4)
-        fused = fuse(self, report, stop=stop)
+        fused = fuse(self, report, stop=stop, with_likelihood=with_likelihood)
         return replace(fused, fix=replace(fused.fix, status="inconsistent"))
 
     def search(self: Locator, report: Report, fix: Fix, *, stop: Stop) -> Fix:

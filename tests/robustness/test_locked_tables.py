@@ -50,7 +50,7 @@ def test_a_build_replaces_a_table_that_is_being_read(hall_table_copy: Path, hall
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.ESTALE, errno.EIO, errno.EAGAIN])
 def test_errors_of_the_system_are_no_damage(number: int) -> None:
     with (
-        pytest.raises(TableError, match=r"t\.h5 cannot be read \(.+\); see whether") as caught,
+        pytest.raises(TableError, match=r"t\.h5 cannot be read \(.+\); check that its disk") as caught,
         damage_reported(Path("t.h5")),
     ):
         raise OSError(number, "unable to lock file")

@@ -33,7 +33,7 @@ def test_a_full_disk_is_a_line_and_keeps_what_is_finished(site: Path, tmp_path: 
     assert done.returncode == 2, done.stderr
     line = done.stderr.splitlines()[-1]
     assert line.startswith("rayfix: cannot save ")
-    assert "No space left on device; nothing finished is lost: free some space and run the same build again" in line
+    assert "No space left on device; finished blocks are kept: free some space and run the same build again" in line
     assert "Traceback" not in done.stderr
     assert not [name for name in done.stdout.splitlines() if "partial" in name or name.endswith(".h5")]
 

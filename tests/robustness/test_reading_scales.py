@@ -21,7 +21,7 @@ from rayfix_service.fusion.posterior.fix import Fix, Outcome
 from rayfix_service.locator import Locator
 from rayfix_service.wire import FieldProblem, InvalidReportError, fix_to_document, parse_report, problems_of
 from rayfix_service.wire.batches import split_batch
-from rayfix_service.wire.limits import USUAL_LIMITS, has_more_values
+from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits, has_more_values
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table
@@ -407,7 +407,7 @@ def test_a_batch_of_unknown_keys_takes_no_more_memory_than_its_text(body: bytes)
     try:
         for text in split_batch(body):
             try:
-                parse_report(text, most_problems=1)
+                parse_report(text, limits=MessageLimits(listed_problems=1))
             except ReportError as error:
                 found.append(problems_of(error))
     except ReportError as error:

@@ -93,6 +93,7 @@ NOT_IN_IDENTITY = {
     "offline.twin.partitions.LEAST_LENGTH": CHECK_ONLY,
     "offline.twin.partitions.MOST_SAMPLES": CHECK_ONLY,
     "offline.twin.partitions.ROOM_AREA": CHECK_ONLY,
+    "offline.twin.partitions._samples": CHECK_ONLY,
     "offline.twin.partitions.THICKNESS": CHECK_ONLY,
     "offline.twin.partitions.UPRIGHT": CHECK_ONLY,
     "offline.twin.solids.is_inside": BY_CHECKSUM,

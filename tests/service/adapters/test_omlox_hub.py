@@ -143,7 +143,7 @@ def test_at_the_end_patience_is_short(hub: Hub):
 
 @pytest.mark.parametrize("url", ["hub:8081", "ftp://hub", "http://", "http://hub/v2?a=1"])
 def test_an_address_that_is_none_is_refused(url: str):
-    with pytest.raises(HubError, match="no address"):
+    with pytest.raises(HubError, match="not an address"):
         HubSettings(url=url)
 
 

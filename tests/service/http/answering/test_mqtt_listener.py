@@ -140,7 +140,10 @@ def test_one_of_several_workers_reads_the_broker(mosquitto: Mosquitto, hall_tabl
         (["--mqtt-topic", "a/+/+"], "--mqtt-topic is for an MQTT broker; name it by --mqtt HOST"),
         (["--mqtt", "mqtt://host"], "give HOST or HOST:PORT"),
         (["--mqtt", "localhost", "--mqtt-window", "0"], "window is 0"),
-        (["--mqtt", "localhost", "--mqtt-station", "a=nowhere"], "a is to be station 'nowhere', which is not in the"),
+        (
+            ["--mqtt", "localhost", "--mqtt-station", "a=nowhere"],
+            "a is mapped to station 'nowhere', which is not in the",
+        ),
         (["--mqtt", "localhost", "--mqtt-table", "other"], "there is no 'other'; give --mqtt-table, one of hall"),
     ],
 )
@@ -188,7 +191,7 @@ def test_the_options_are_those_of_the_command_of_its_own(monkeypatch: pytest.Mon
     )
     if "--mqtt" in own:
         own, served = served, own
-    common = {"-h", "--help", "--omlox-hub", "--broker"}
+    common = {"-h", "--help", "--omlox-hub", "--hub-answer-kib", "--broker"}
     assert {option.replace("--", "--mqtt-", 1) for option in own - common} <= served
 
 
