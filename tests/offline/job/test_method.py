@@ -118,7 +118,6 @@ NOT_IN_IDENTITY = {
     "offline.job.shards._DIGEST_BYTES": DEFINITION,
     "offline.job.shards._FOLDER": "how a folder is opened",
     "offline.job.shards._REMOVAL_SECONDS": SAME_BITS,
-    "tables.gaussians.conditioning.LOG_2PI": DEFINITION,
     "tables.gaussians.normal_points.unit_points": "used by the service only",
     "tables.level.WINDOW_RATIO": "the default of window_ratio in CoarseFit and BalanceSettings",
     "tables.level.UNBALANCED": "an empty array",
