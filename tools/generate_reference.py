@@ -158,7 +158,7 @@ def command_page() -> str:
         lines += [
             f"\n## rayfix {name}\n",
             f"{helps[name][0].upper()}{helps[name][1:]}.\n",
-            f"<!-- not run: usage -->\n```sh\n{_usage(command)}\n```\n",
+            f"<!-- not run: the usage, with names for arguments -->\n```sh\n{_usage(command)}\n```\n",
         ]
         lines += ["| argument | meaning |", "|---|---|"]
         lines += [f"| {form} | {text} |" for form, text in _arguments(command)]
