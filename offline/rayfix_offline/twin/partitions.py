@@ -60,7 +60,7 @@ class Partitions:
 
 
 def find_partitions(scene: Scene, free_space: FreeSpace, *, closed: bool) -> Partitions:
-    """Find the thin walls that divide the free space into rooms.
+    """Find the thin walls that divide the free space into rooms; none where the voxels are wider than half a door.
 
     Parameters
     ----------
@@ -68,6 +68,8 @@ def find_partitions(scene: Scene, free_space: FreeSpace, *, closed: bool) -> Par
         Whether all of the free space lies inside the building; otherwise regions at the border are outdoors.
     """
     none = Partitions(faces=np.zeros(len(scene.faces), bool), rooms=0)
+    if free_space.voxel_size > HALF_DOOR:  # a map this coarse shows neither thin walls nor doors
+        return none
     face, point, normal = _samples(scene)
     if not len(face) or not free_space.free.any():
         return none
