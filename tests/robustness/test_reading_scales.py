@@ -1,5 +1,6 @@
 """Reading takes time in proportion to the message at most, and little memory, whatever the message is made of."""
 
+import gc
 import json
 import pickle
 from collections.abc import Callable
@@ -227,12 +228,21 @@ def attempt(read: Read, message: bytes) -> object:
 
 
 def seconds(work: Callable[[], object], runs: int) -> float:
-    """Processor time of this thread that the fastest of several runs takes."""
+    """Processor time of this thread that the fastest of several runs takes.
+
+    The collector rests, as with ``timeit``: its time grows with what other tests have left in memory.
+    """
     taken = []
-    for _ in range(runs):
-        begin = thread_time()
-        work()
-        taken.append(thread_time() - begin)
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        for _ in range(runs):
+            begin = thread_time()
+            work()
+            taken.append(thread_time() - begin)
+    finally:
+        if collects:
+            gc.enable()
     return min(taken)
 
 
