@@ -21,6 +21,9 @@ _PREFIX = "+UUDF:"
 _TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d{1,9})?(?:Z|[+-]\d\d:?\d\d)?")
 """Time that a log writes before an event: ISO 8601, UTC unless it has a time zone."""
 
+_LONGEST_MS = 24 * 3600 * 1000
+"""Lines of one message are at most a day older than its last one; a larger difference is of a clock that started anew."""
+
 _LISTED = 20
 """Largest number of unreadable lines that are listed; further ones are only counted."""
 
@@ -29,8 +32,8 @@ _LISTED = 20
 class AngleErrors:
     """Errors of anchors' angles, which the anchors do not report.
 
-    The defaults are fitted to angles recorded indoors (docs/real-data.md): four of five errors have a standard
-    deviation of about 10 deg, and one in five has a distribution three times as wide.
+    The defaults are cautious values for Bluetooth angles indoors, whose errors are far wider than the noise of packets:
+    four of five have a standard deviation of 10 deg, one in five has three times that.
 
     Attributes
     ----------
@@ -253,6 +256,8 @@ def _logged(before: str) -> datetime | None:
 def _time_of(lines: Sequence[_Line], latest: Mapping[str, int], received: datetime | None) -> str | None:
     """Return the time of a transmission, RFC 3339, or None if it is unknown.
 
+    An anchor that restarted between its lines counts from zero again: of the earlier ones the age is unknown.
+
     Parameters
     ----------
     lines : sequence of _Line
@@ -267,9 +272,9 @@ def _time_of(lines: Sequence[_Line], latest: Mapping[str, int], received: dateti
         return min(logged).isoformat()
     if received is None:
         return None
-    # An anchor that restarted in between counts from zero again; its lines are then taken to be the latest.
-    back = max(latest[line.event.anchor] - line.event.timestamp_ms for line in lines)
-    return (received - timedelta(milliseconds=max(back, 0))).isoformat()
+    ages = [latest[line.event.anchor] - line.event.timestamp_ms for line in lines]
+    known = [age for age in ages if 0 <= age <= _LONGEST_MS]
+    return (received - timedelta(milliseconds=max(known))).isoformat() if known else None
 
 
 def _not_valid(faulty: Sequence[FieldProblem]) -> list[Skipped]:

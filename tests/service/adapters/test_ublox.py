@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from rayfix_service.adapters.ublox import AngleErrors, UudfEvent, parse_ublox, parse_uudf
 from rayfix_service.fusion.measurements.report import Angle, ErrorModel
+from rayfix_service.measuring.timestamps import utc_moment
 from rayfix_service.wire import InvalidReportError
 from rayfix_tables.errors import SettingsError
 from tests.support.checkout import SHARED
@@ -214,3 +215,18 @@ def test_without_a_log_times_are_counted_back_from_the_receipt_by_the_anchors_cl
     times = [datetime.fromisoformat(str(time)) for time in timestamps(text, now)]
     assert [round((now - time).total_seconds(), 6) for time in times] == [0.25, 0.15, 0.0]
     assert timestamps(text) == [None, None, None]
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 2**64), (2**63, 0), (500, 400), (0, 86_400_001)])
+def test_clocks_that_cannot_be_right_give_no_time(first: int, last: int):
+    """An anchor that started anew, and differences that no datetime can hold."""
+    text = "\n".join(line("t", "a", n).replace("1437347", str(ms)) for n, ms in enumerate((first, last)))
+    now = datetime(2026, 11, 30, tzinfo=UTC)
+    assert timestamps(text, now) == [None, now.isoformat()]
+
+
+@pytest.mark.parametrize("text", ["0001-01-01T00:00:00+14:00", "9999-12-31T23:59:59-12:00"])
+def test_times_at_the_ends_of_the_calendar_can_be_followed(text: str):
+    (timestamp,) = timestamps(f"{text} {line('t', 'a', 1)}")
+    assert timestamp is not None
+    assert utc_moment(timestamp).tzinfo is UTC
