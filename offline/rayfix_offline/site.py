@@ -37,17 +37,18 @@ class SiteSection(_Section):
     """``[site]``: the scene and how to read it."""
 
     name: Annotated[str, Field(min_length=1, max_length=100)] = Field(
-        description="name of the site, which answers carry as source"
+        description="name of the site; answers give it as their source"
     )
     scene: Annotated[str, Field(min_length=1)] = Field(
         description="scene file, relative to the site file: glb, gltf, obj, ply, stl, dae, Mitsuba XML or IFC",
-        json_schema_extra={"effect": "time and size grow with the clutter: see Large sites"},
+        json_schema_extra={"effect": "time and size grow with the number of objects: see Large sites"},
     )
     scene_unit: Literal["m", "cm", "mm", "in", "ft"] = Field(
-        default="m", description="unit of the scene file, where the file does not say"
+        default="m", description="unit of the scene file, if the file does not state one"
     )
     scene_up: Literal["z", "y"] = Field(
-        default="z", description="axis of the scene file that points up; glTF and IFC say it themselves"
+        default="z",
+        description="axis of the scene file that points up, y in most glTF files; COLLADA and IFC files state it themselves",
     )
     north_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
         default=90.0,
@@ -69,37 +70,39 @@ class PropagationSection(_Section):
     carrier_ghz: Annotated[float, Field(gt=0, le=1000)] = Field(
         default=3.5,
         description="carrier frequency, for the materials of reflection = itu",
-        json_schema_extra={"effect": "none"},
+        json_schema_extra={"effect": "time and size stay the same"},
     )
     max_reflections: Annotated[int, Field(ge=0, le=8)] = Field(
         default=3,
-        description="reflections that a path may have",
-        json_schema_extra={"effect": "time and size grow with each"},
+        description="largest number of reflections of a path",
+        json_schema_extra={"effect": "time and size grow with each reflection"},
     )
     max_path_length_m: Annotated[float, Field(gt=0, le=10_000)] = Field(
         default=60.0,
-        description="longest path; at least the diagonal of the hall",
-        json_schema_extra={"effect": "time and size grow with it, as long as rays get that far"},
+        description="largest length of a path; at least the diagonal of the hall",
+        json_schema_extra={"effect": "time and size grow with it, as long as rays reach that far"},
     )
     reflection: Literal["constant", "itu"] = Field(
         default="constant",
-        description="loss of a reflection: the same for each, or by ITU-R P.2040 from the names of the materials",
-        json_schema_extra={"effect": "none"},
+        description="reflection loss: constant, or computed from the material names by ITU-R P.2040",
+        json_schema_extra={"effect": "time and size stay the same"},
     )
     reflection_loss_db: Annotated[float, Field(ge=0, le=100)] = Field(
         default=6.0,
-        description="loss of each reflection; with itu, of materials without a known name",
-        json_schema_extra={"effect": "none"},
+        description="loss of each reflection; with itu, for materials without a known name",
+        json_schema_extra={"effect": "time and size stay the same"},
     )
     path_prior: Literal["power", "uniform", "paper"] = Field(
         default="power",
-        description="which path a station reports: the strong ones rather, any, or as in the paper",
-        json_schema_extra={"effect": "only power is balanced, which takes some time at the end"},
+        description="path-selection prior: strong paths preferred, any path alike, or as in the paper",
+        json_schema_extra={
+            "effect": "with power the probabilities are normalised at the end of the build, which takes some time"
+        },
     )
     path_prior_exponent: Annotated[float, Field(ge=0, le=20)] = Field(
         default=2.0,
-        description="how much strong paths are preferred: their power to this exponent",
-        json_schema_extra={"effect": "none"},
+        description="exponent of the path gain in the path-selection prior; a larger one prefers strong paths more",
+        json_schema_extra={"effect": "time and size stay the same"},
     )
 
 
@@ -113,13 +116,13 @@ class TableSection(_Section):
     )
     fit: Literal["tubes", "em"] = Field(
         default="tubes",
-        description="how a cell is fitted: ray tubes, or the expectation-maximisation of the paper",
+        description="method of fitting a cell: ray tubes, or the paper's expectation-maximisation",
         json_schema_extra={"effect": "em takes several hundred times as long"},
     )
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(
         default=1,
         description="seed of the random offsets of the rays",
-        json_schema_extra={"effect": "none"},
+        json_schema_extra={"effect": "time and size stay the same"},
     )
 
     @model_validator(mode="after")
@@ -138,17 +141,19 @@ class BiasSection(_Section):
     """``[stations.bias]``: systematic errors of a station, measured minus true."""
 
     range_m: Annotated[float, Field(ge=-10_000, le=10_000)] = Field(
-        default=0.0, description="of times as lengths, measured minus true"
+        default=0.0, description="bias of propagation times as lengths, measured minus true"
     )
     range_stdev_m: Annotated[float, Field(ge=0, le=10_000)] = Field(
-        default=0.0, description="how uncertain that is: a standard deviation"
+        default=0.0, description="standard deviation of the range bias"
     )
     azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
-        default=0.0, description="of azimuths, in the frame in which the station reports them"
+        default=0.0, description="bias of azimuths, in the frame in which the station reports them"
     )
-    zenith_deg: Annotated[float, Field(ge=-90, le=90)] = Field(default=0.0, description="of zenith angles, likewise")
+    zenith_deg: Annotated[float, Field(ge=-90, le=90)] = Field(
+        default=0.0, description="bias of zenith angles, in the same frame"
+    )
     angle_stdev_deg: Annotated[float, Field(ge=0, le=90)] = Field(
-        default=0.0, description="how uncertain either of these two is: a standard deviation"
+        default=0.0, description="standard deviation of the azimuth bias and of the zenith bias"
     )
 
 
@@ -157,7 +162,7 @@ class StationSection(_Section):
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}$")] = Field(
         description="name that reports use: 1 to 64 letters, digits or . _ : -",
-        json_schema_extra={"effect": "built again under another name"},
+        json_schema_extra={"effect": "a new name builds the station again"},
     )
     position_m: tuple[Coordinate, Coordinate, Coordinate] = Field(
         description="position of the antenna in the scene frame: x, y, z",
@@ -166,29 +171,29 @@ class StationSection(_Section):
     mounting: Mounting = Field(
         default="3gpp",
         description="local frame of the array: which of its axes are the boresight and the upper edge",
-        json_schema_extra={"effect": "as of the boresight"},
+        json_schema_extra={"effect": "as that of boresight_azimuth_deg"},
     )
     boresight_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None = Field(
         default=None,
-        description="where the array looks, counter-clockwise from +x of the scene; 0 unless given",
+        description="azimuth of the boresight, counter-clockwise from +x of the scene; 0 unless given",
         json_schema_extra={
-            "effect": "with a field of view of 360 deg nothing is built again, else what comes into view"
+            "effect": "with a field of view of 360 deg nothing is built again, else the cells that come into view"
         },
     )
     boresight_downtilt_deg: Annotated[float, Field(ge=-90, le=90)] | None = Field(
         default=None,
-        description="how far it looks below the horizon; 0 unless given",
-        json_schema_extra={"effect": "likewise"},
+        description="angle of the boresight below the horizon; 0 unless given",
+        json_schema_extra={"effect": "as that of boresight_azimuth_deg"},
     )
     roll_deg: Annotated[float, Field(ge=-360, le=360)] | None = Field(
         default=None,
-        description="turn about the boresight, clockwise for who looks along it; 0 unless given",
+        description="rotation about the boresight, clockwise when looking along it; 0 unless given",
         json_schema_extra={"effect": "nothing is built again"},
     )
     orientation_deg: Triple | None = Field(
         default=None,
-        description="instead of these three: bearing, downtilt and slant of TR 38.901",
-        json_schema_extra={"effect": "likewise"},
+        description="bearing, downtilt and slant of 3GPP TR 38.901, instead of the three keys above",
+        json_schema_extra={"effect": "as that of boresight_azimuth_deg"},
     )
     field_of_view_deg: Annotated[float, Field(gt=0, le=360)] = Field(
         default=360.0,
@@ -197,7 +202,7 @@ class StationSection(_Section):
     )
     bias: BiasSection = Field(
         default=BiasSection(),
-        description="what the station measures wrongly each time: a table of the keys below",
+        description="systematic errors of the station: a table with the keys below",
         json_schema_extra={"effect": "nothing is built again"},
     )
 

@@ -157,12 +157,19 @@ class Locator:
         posterior = make_posterior(product.hypotheses, product.prior, scene.free_space_in_table_frame, stop)
         return posterior.moved(scene.origin)
 
-    def seconds(self, report: Report) -> float:
+    def seconds(self, report: Report, *, with_likelihood: bool = False) -> float:
         """Estimate how long a fix of a report will take, s, within some microseconds.
 
         The estimate separates quick fixes from slow ones; it is infinite for a report that is slow in any case.
+
+        Parameters
+        ----------
+        report : Report
+        with_likelihood : bool
+            Whether :meth:`fuse` is to keep the likelihood, which is a second product for a report with a known height.
         """
-        return self._fusion.seconds(report)
+        products = 2 if with_likelihood and report.height is not None else 1
+        return products * self._fusion.seconds(report)
 
     def warm_up(self) -> None:
         """Compile the kernels and prepare reports without angles, by locating a report of each kind."""

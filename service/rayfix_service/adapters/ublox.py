@@ -22,7 +22,7 @@ _TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d{1,9})?(?:Z|[+-]\
 """Time that a log writes before an event: ISO 8601, UTC unless it has a time zone."""
 
 _LONGEST_MS = 24 * 3600 * 1000
-"""Lines of one message are at most a day older than its last one; a larger difference is of a clock that started anew."""
+"""Lines are at most a day older than the last one of their message; a larger difference is an anchor's restart."""
 
 _LISTED = 20
 """Largest number of unreadable lines that are listed; further ones are only counted."""

@@ -84,9 +84,9 @@ def _connected(log_density: Any, mean: Any, precision: Any, a: Any, b: Any, floo
     point = np.empty(3)
     for step in range(_POINTS):
         offset = (step + 1) // 2 if step % 2 else -(step // 2)
-        share = 0.5 + offset / (_POINTS + 1)
+        fraction = 0.5 + offset / (_POINTS + 1)
         for i in range(3):
-            point[i] = a[i] + share * (b[i] - a[i])
+            point[i] = a[i] + fraction * (b[i] - a[i])
         if _log_mixture(log_density, mean, precision, point) < floor:
             return False
     return True

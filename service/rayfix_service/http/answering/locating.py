@@ -165,14 +165,15 @@ class Answerer:
         """
         report = incoming.report
         locator = table.locator
-        quick = locator.seconds(report) <= self.quick_seconds
+        follows = options.follows(report)
+        quick = locator.seconds(report, with_likelihood=follows) <= self.quick_seconds
         start = perf_counter()
         try:
-            fuse = partial(locator.fuse, with_likelihood=options.follows(report))
+            fuse = partial(locator.fuse, with_likelihood=follows)
             fused = fuse(report, stop=NEVER) if quick else await self.slow_work.locate(fuse, report)
             seconds = perf_counter() - start
             self.metrics.fix_done(fused.fix, seconds, table=table.name, site=table.site, report=report)
-            track = table.tracker.follow(fused) if options.follows(report) else None
+            track = table.tracker.follow(fused) if follows else None
         except ReportError as error:
             if incoming.adapted is None:
                 raise

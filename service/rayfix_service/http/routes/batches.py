@@ -1,6 +1,5 @@
 """Answering the reports of a batch, each on its own."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -13,13 +12,10 @@ from rayfix_service.http.answering.locating import Answerer, Incoming
 from rayfix_service.http.answering.response_options import ResponseOptions
 from rayfix_service.http.answering.served_tables import ServedTable
 from rayfix_service.http.routes.json_answer import JsonAnswer, results_answer, write_json
+from rayfix_service.http.routes.one_report import ReadOne
 from rayfix_service.http.telemetry.report_figures import Source
 from rayfix_service.wire import MalformedJsonError
 from rayfix_service.wire.batches import split_batch
-from rayfix_service.wire.limits import MessageLimits
-
-ReadOne = Callable[[bytes, MessageLimits], Incoming]
-"""Reads the JSON text of one report."""
 
 
 async def answer_batch(
@@ -50,7 +46,7 @@ async def answer_batch(
         await cooperation.let_others_run()
         own = limits if listed < limits.listed_problems else replace(limits, listed_problems=1)
         try:
-            reports.append(await answerer.read(partial(_read, read_one, own), text))
+            reports.append(await answerer.read(partial(read_one, limits=own), text))
         except MalformedJsonError as error:
             raise MalformedJsonError(f"reports[{number}]: {error}") from None
         except Exception as error:
@@ -69,10 +65,6 @@ async def answer_batch(
         else:
             results.append(write_json(report))
     return results_answer(results)
-
-
-def _read(read_one: ReadOne, limits: MessageLimits, text: bytes) -> Incoming:
-    return read_one(text, limits)
 
 
 def _itself(report: Incoming) -> Incoming:

@@ -65,8 +65,7 @@ async def post_nrppa(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Take the measurements of a MEASUREMENT RESPONSE or REPORT of 3GPP TS 38.455, with the names of its ASN.1."""
-    read = partial(_read_nrppa, limits=answerer.message_limits)
-    return await answer_one(read, body, answerer, table, options, "nrppa")
+    return await answer_one(_read_nrppa, body, answerer, table, options, "nrppa")
 
 
 @router.post(
@@ -80,8 +79,7 @@ async def post_silabs(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: MessageOptionsDep
 ) -> JsonAnswer:
     """Take the angles that Silicon Labs' Bluetooth locators measured of one packet of a tag."""
-    read = partial(_read_silabs, limits=answerer.message_limits)
-    return await answer_one(read, body, answerer, table, options, "silabs")
+    return await answer_one(_read_silabs, body, answerer, table, options, "silabs")
 
 
 @router.post(
@@ -112,11 +110,11 @@ async def post_silabs_batch(
     return await answer_batch(request, answerer, table, body, options, _read_silabs, "silabs_batch")
 
 
-def _read_nrppa(text: bytes, limits: MessageLimits) -> Incoming:
+def _read_nrppa(text: bytes, *, limits: MessageLimits) -> Incoming:
     return foreign(parse_nrppa(text, limits=limits))
 
 
-def _read_silabs(text: bytes, limits: MessageLimits) -> Incoming:
+def _read_silabs(text: bytes, *, limits: MessageLimits) -> Incoming:
     return foreign(parse_silabs(text, limits=limits))
 
 

@@ -1,14 +1,13 @@
 """Routes that locate."""
 
 import asyncio
-from functools import partial
 
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 from starlette.datastructures import State
 from starlette.types import Receive, Scope
 
-from rayfix_service.http.answering.locating import Incoming, native
+from rayfix_service.http.answering.locating import native
 from rayfix_service.http.answering.response_options import response_options_of
 from rayfix_service.http.openapi.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
 from rayfix_service.http.openapi.responses import NATIVE_ANSWER, POSITION_PROBLEMS, NativeOrOther, request_body
@@ -26,7 +25,6 @@ from rayfix_service.http.routes.json_answer import JsonAnswer, write_json
 from rayfix_service.http.routes.one_report import answer_one
 from rayfix_service.http.services import services_in
 from rayfix_service.wire import BatchDocument, ReportDocument
-from rayfix_service.wire.limits import MessageLimits
 
 
 class BatchResult(BaseModel):
@@ -55,8 +53,7 @@ async def post_position(
     answerer: AnswererDep, table: TableDep, body: ReportBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Fuse the measurements of one transmission into a position, with its uncertainty and its rivals."""
-    read = partial(native, limits=answerer.message_limits)
-    return await answer_one(read, body, answerer, table, options, "positions")
+    return await answer_one(native, body, answerer, table, options, "positions")
 
 
 async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple[bytes, str]:
@@ -89,8 +86,4 @@ async def post_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: ResponseOptionsDep
 ) -> JsonAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
-    return await answer_batch(request, answerer, table, body, options, _read_native, "batch")
-
-
-def _read_native(text: bytes, limits: MessageLimits) -> Incoming:
-    return native(text, limits=limits)
+    return await answer_batch(request, answerer, table, body, options, native, "batch")
