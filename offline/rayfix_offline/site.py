@@ -48,7 +48,7 @@ class SiteSection(_Section):
     )
     scene_up: Literal["z", "y"] = Field(
         default="z",
-        description="axis of the scene file that points up, y in most glTF files; COLLADA and IFC files state it themselves",
+        description="axis of the scene file that points up, y in most glTF files; COLLADA and IFC files state it",
     )
     north_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
         default=90.0,
