@@ -24,7 +24,7 @@ from rayfix_service.fusion.product.prior import Prior, uniform_prior
 from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.wire import parse_report
-from tests.support import kernel_twins
+from tests.support.oracles import kernel_twins
 
 Array = NDArray[np.float64]
 Measurements = list[dict[str, Any]]

@@ -31,7 +31,7 @@ from rayfix_tables.disk.files import open_table_file
 from rayfix_tables.disk.schema import read_text
 from rayfix_tables.errors import TableError
 from rayfix_tables.table import Table
-from tests.support.random_tables import random_content
+from tests.support.tables.random_tables import random_content
 
 MEMORY = 256_000_000
 

@@ -10,7 +10,7 @@ import pytest
 
 from rayfix_service.web.assets import load_assets
 from tests.support.checkout import ROOT
-from tests.support.server_process import start_rayfix_serve
+from tests.support.running.server_process import start_rayfix_serve
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 

@@ -20,7 +20,7 @@ from rayfix.example.hall import hall_scene, hall_stations
 from rayfix_evaluation.drops.simulate import simulate_report
 from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_offline.build import build_table
-from tests.support.server_process import start_rayfix_serve
+from tests.support.running.server_process import start_rayfix_serve
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"

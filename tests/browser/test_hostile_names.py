@@ -11,8 +11,8 @@ import pytest
 
 from rayfix.cli import main
 from rayfix_tables.site import Station
-from tests.support.hand_tables import POSITIONS, UE, line_of_sight, table_of
-from tests.support.server_process import start_rayfix_serve
+from tests.support.running.server_process import start_rayfix_serve
+from tests.support.tables.hand_tables import POSITIONS, UE, line_of_sight, table_of
 
 expect = pytest.importorskip("playwright.sync_api", reason="playwright is not installed").expect
 

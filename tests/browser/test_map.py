@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from rayfix_offline.build import build_table
-from tests.support.map_site import POSITIONS, SHIFT, UE, report, write_site
-from tests.support.server_process import start_rayfix_serve
+from tests.support.running.server_process import start_rayfix_serve
+from tests.support.scenes.map_site import POSITIONS, SHIFT, UE, report, write_site
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rayfix.example.drop import example_paths, report_text, simulate_example_report
-from tests.support.server_process import start_rayfix_serve
+from tests.support.running.server_process import start_rayfix_serve
 
 expect = pytest.importorskip("playwright.sync_api", reason="playwright is not installed").expect
 

@@ -18,7 +18,7 @@ from rayfix.example.hall import hall_scene, hall_stations
 from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_service.http.access.keys import add_key
 from rayfix_service.http.openapi.examples import UBLOX_EXAMPLES
-from tests.support.server_process import start_rayfix_serve
+from tests.support.running.server_process import start_rayfix_serve
 
 expect = pytest.importorskip("playwright.sync_api", reason="playwright is not installed").expect
 

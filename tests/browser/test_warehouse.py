@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from rayfix_offline.build import build_table
-from tests.support.server_process import start_rayfix_serve
-from tests.support.sites import stations_text
+from tests.support.running.server_process import start_rayfix_serve
+from tests.support.scenes.sites import stations_text
 
 TARGETS, HERTZ, SECONDS = 20, 5.0, 6.0
 

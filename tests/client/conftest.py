@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.server_process import start_rayfix_serve
+from tests.support.running.server_process import start_rayfix_serve
 
 
 @pytest.fixture(scope="session")

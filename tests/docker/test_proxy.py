@@ -16,8 +16,8 @@ import pytest
 from websockets.sync.client import connect
 
 from tests.support.checkout import ROOT
-from tests.support.reports import REPORT
-from tests.support.server_process import start_rayfix_serve
+from tests.support.messages.reports import REPORT
+from tests.support.running.server_process import start_rayfix_serve
 
 PROXY = ROOT / "docker" / "proxy"
 

@@ -20,7 +20,7 @@ from rayfix.cli import main
 from rayfix.example.files import example_report
 from tests.support.checkout import ROOT
 from tests.support.doc_blocks import PAGES, Block, blocks_of, commands_of
-from tests.support.server_process import ServerProcess, start_rayfix_serve
+from tests.support.running.server_process import ServerProcess, start_rayfix_serve
 
 RUNNABLE = {page: [block for block in blocks_of(page) if block.reason is None] for page in PAGES}
 SERVED = [

@@ -14,8 +14,8 @@ from rayfix_offline.rays.segments import Segments
 from rayfix_offline.scene.engine import EmbreeEngine
 from rayfix_offline.scene.materials import Reflectivity, constant_reflectivity
 from rayfix_offline.twin.planes import merge_coplanar
-from tests.support.rooms import CABINET, ROOM, TABLE, scene_of_boxes
-from tests.support.shapes import box
+from tests.support.scenes.rooms import CABINET, ROOM, TABLE, scene_of_boxes
+from tests.support.scenes.shapes import box
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ import pytest
 
 from rayfix_offline.site import parse_site, read_site
 from rayfix_tables.errors import SiteError
-from tests.support.refusals import refusal
+from tests.support.messages.refusals import refusal
 
 Document = Callable[..., dict[str, Any]]
 

@@ -7,7 +7,7 @@ import pytest
 from tests.support.checkout import ROOT
 
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-SOURCES = ("evaluation", "offline", "rayfix", "service", "tables")
+SOURCES = ("benchmarks", "evaluation", "offline", "rayfix", "service", "tables", "tests", "tools")
 FOLDERS = sorted({path.parent for source in SOURCES for path in (ROOT / source).rglob("*.py")})
 
 

@@ -26,8 +26,8 @@ from rayfix.cli import main
 from rayfix_offline.build import build_table
 from rayfix_offline.check import check_site
 from rayfix_tables.table import Table
-from tests.support.map_site import POSITIONS, SHIFT, UE, report, write_site
-from tests.support.running_app import RunningApp
+from tests.support.running.running_app import RunningApp
+from tests.support.scenes.map_site import POSITIONS, SHIFT, UE, report, write_site
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from rayfix.view import ViewError, inline, read_reports
 from rayfix_service.web.assets import load_assets
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
-from tests.support.reports import REPORT
+from tests.support.messages.reports import REPORT
 
 
 def data_of(page: str) -> dict:

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from rayfix_tables.table import Table
-from tests.support.hand_tables import MakeTable, Tube, table_of
-from tests.support.running_app import RunningApp
+from tests.support.running.running_app import RunningApp
+from tests.support.tables.hand_tables import MakeTable, Tube, table_of
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.random_tables import Content, random_content
+from tests.support.tables.random_tables import Content, random_content
 
 
 @pytest.fixture(scope="session")

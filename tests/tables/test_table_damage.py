@@ -14,8 +14,8 @@ from rayfix_tables.disk.schema import LEVEL_DATASETS, SCENE_DATASETS, TEXT_DATAS
 from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError, TableError
 from rayfix_tables.mixture import FIELD_SHAPES
 from rayfix_tables.table import Table
-from tests.support.refusals import refusal
-from tests.support.table_edits import put_text
+from tests.support.messages.refusals import refusal
+from tests.support.tables.table_edits import put_text
 
 REBUILD = "restore it from a copy or build it again"
 LEVEL = "stations/bs1/levels/1"

@@ -10,7 +10,7 @@ from rayfix_evaluation.baselines.fingerprints import Fingerprinting, RadioMap, s
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_tables.geometry.angles import direction
 from rayfix_tables.table import Table
-from tests.support.every_rival import every_rival
+from tests.support.oracles.every_rival import every_rival
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from rayfix_offline.build import build_table
 from rayfix_service.locator import Locator
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Table
-from tests.support.running_app import RunningApp
-from tests.support.sites import stations_text
+from tests.support.running.running_app import RunningApp
+from tests.support.scenes.sites import stations_text
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from rayfix_evaluation.pictures.files import save_picture, set_plan_limits
 from rayfix_evaluation.pictures.plot import make_figure
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.table import Table
-from tests.support.reports import REPORT
+from tests.support.messages.reports import REPORT
 
 
 def test_a_marginal_is_the_mixture_of_the_marginals():

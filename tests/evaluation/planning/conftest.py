@@ -19,7 +19,7 @@ import trimesh
 
 from rayfix_offline.build import build_table
 from rayfix_tables.table import Table
-from tests.support.sites import stations_text
+from tests.support.scenes.sites import stations_text
 
 STATIONS = {"a": (0.5, 0.6, 2.6), "b": (3.6, 0.4, 2.3), "c": (3.2, 4.5, 2.7)}
 

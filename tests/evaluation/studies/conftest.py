@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from tests.support.sites import stations_text
+from tests.support.scenes.sites import stations_text
 
 _SITE = """
 [site]

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from rayfix.example.hall import hall_scene
 from rayfix_evaluation.truth.forward import ForwardSolver
-from tests.support.forward_paths import solver_of
+from tests.support.oracles.forward_paths import solver_of
 
 Array = NDArray[np.float64]
 

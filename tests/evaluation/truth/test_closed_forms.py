@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.support.forward_paths import SIX_DB, bounces, direction, rotation, solver_of
-from tests.support.shapes import box, quad
+from tests.support.oracles.forward_paths import SIX_DB, bounces, direction, rotation, solver_of
+from tests.support.scenes.shapes import box, quad
 
 
 def test_one_wall() -> None:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rayfix_tables.errors import SceneError
-from tests.support.forward_paths import solver_of
-from tests.support.shapes import quad
+from tests.support.oracles.forward_paths import solver_of
+from tests.support.scenes.shapes import quad
 
 
 def test_meshes_that_cannot_be_used() -> None:

@@ -6,8 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_evaluation.truth.forward import ForwardSolver, Paths
-from tests.support.forward_paths import EXACT, assert_same_paths, bounces, direction, hall_pairs, rotation, solver_of
-from tests.support.shapes import box
+from tests.support.oracles.forward_paths import (
+    EXACT,
+    assert_same_paths,
+    bounces,
+    direction,
+    hall_pairs,
+    rotation,
+    solver_of,
+)
+from tests.support.scenes.shapes import box
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from rayfix.example.hall import HALL_SIZE, hall_stations
 from rayfix_evaluation.truth.forward import ForwardSolver, Paths, StationSolver
 from rayfix_evaluation.truth.mirrors import ImageTree
-from tests.support.forward_paths import assert_same_paths, bounces, solver_of
-from tests.support.shapes import box, quad
+from tests.support.oracles.forward_paths import assert_same_paths, bounces, solver_of
+from tests.support.scenes.shapes import box, quad
 
 Array = NDArray[np.float64]
 

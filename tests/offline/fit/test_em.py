@@ -14,7 +14,7 @@ from rayfix_offline.rays.trace import LevelRays
 from rayfix_offline.site import parse_site
 from rayfix_tables.geometry.angles import direction
 from rayfix_tables.mixture import FIELD_SHAPES, unpack
-from tests.support.rooms import CABINET, ROOM, finest_level, scene_of_boxes
+from tests.support.scenes.rooms import CABINET, ROOM, finest_level, scene_of_boxes
 
 CELLS = np.array([250, 100, 3])
 FEW = ExpectationMaximisation(num_points=1000, num_components=(2, 6), seed=3)

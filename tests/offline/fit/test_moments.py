@@ -21,7 +21,7 @@ from rayfix_offline.rays.pieces import Pieces, cut_pieces
 from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments, Sequences
 from rayfix_tables.geometry.angles import direction, tangent
-from tests.support.rays import no_reflections
+from tests.support.oracles.rays import no_reflections
 
 Launch = Callable[..., Segments]
 FLOORS = (RayFit.length_floor, RayFit.position_floor)

@@ -17,8 +17,8 @@ from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture, pack
-from tests.support.path_shares import path_shares
-from tests.support.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_boxes
+from tests.support.scenes.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_boxes
+from tests.support.tables.path_shares import path_shares
 
 Array = NDArray[np.float64]
 WINDOW = np.deg2rad(5.0)

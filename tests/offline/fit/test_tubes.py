@@ -18,7 +18,7 @@ from rayfix_offline.rays.trace import LevelRays
 from rayfix_offline.site import parse_site
 from rayfix_tables.geometry.angles import direction, tangent
 from rayfix_tables.mixture import TubeMixture, unpack, widening_cov
-from tests.support.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_boxes
+from tests.support.scenes.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_boxes
 
 Array = NDArray[np.float64]
 STATION = np.array([3.6, 0.4, 2.6])

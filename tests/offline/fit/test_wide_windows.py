@@ -21,7 +21,7 @@ from rayfix_offline.site import parse_site
 from rayfix_offline.twin.twin import prepare_twin
 from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture, joint_cov
-from tests.support.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_boxes
+from tests.support.scenes.rooms import CABINET, ROOM, TABLE, finest_level, scene_of_boxes
 
 Array = NDArray[np.float64]
 WIDE = np.deg2rad(12.0)

@@ -18,8 +18,8 @@ from rayfix_offline.rays.trace import LevelRays
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.geometry.angles import tangent
 from rayfix_tables.grid import AngularGrid
-from tests.support.rooms import CABINET, ROOM
-from tests.support.shapes import box
+from tests.support.scenes.rooms import CABINET, ROOM
+from tests.support.scenes.shapes import box
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 Launch = Callable[..., Segments]

@@ -11,7 +11,7 @@ import pytest
 
 from rayfix_offline.build import build_table
 from rayfix_tables.errors import BuildError
-from tests.support.rooms import room_with_crate
+from tests.support.scenes.rooms import room_with_crate
 
 SITE = """\
 [site]

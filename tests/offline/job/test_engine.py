@@ -10,7 +10,7 @@ from rayfix_offline.build import build_table
 from rayfix_offline.job import engine, previous_table
 from rayfix_offline.rays.trace import StationTrace, trace_station
 from rayfix_offline.site import StationSection
-from tests.support.rooms import room_with_crate
+from tests.support.scenes.rooms import room_with_crate
 
 WriteSite = Callable[..., Path]
 TWO = [{"id": "bs1", "position_m": [3.6, 0.4, 2.6]}, {"id": "bs2", "position_m": [0.2, 4.8, 2.6]}]

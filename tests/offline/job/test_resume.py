@@ -18,7 +18,7 @@ from rayfix_offline.job.shards import ShardStore
 from rayfix_tables.errors import BuildError
 from rayfix_tables.site import NO_BIAS
 from rayfix_tables.table import Table
-from tests.support.small_sites import write_site
+from tests.support.scenes.small_sites import write_site
 
 STATIONS = {"a": (0.4, 0.5), "b": (3.5, 0.6), "c": (2.0, 4.5)}
 

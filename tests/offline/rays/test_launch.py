@@ -13,7 +13,7 @@ from rayfix_offline.rays.rays import sample_rays
 from rayfix_offline.rays.segments import Segments
 from rayfix_offline.scene.materials import constant_reflectivity
 from rayfix_offline.twin.planes import merge_coplanar
-from tests.support.shapes import quad
+from tests.support.scenes.shapes import quad
 
 Launch = Callable[..., Segments]
 Vectors = Callable[[int, int], NDArray[np.float64]]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_offline.rays.segments import Segments
 from rayfix_tables.geometry.angles import direction
-from tests.support.shapes import box, cut_in_three
+from tests.support.scenes.shapes import box, cut_in_three
 
 Launch = Callable[..., Segments]
 Vectors = Callable[[int, int], NDArray[np.float64]]

@@ -11,7 +11,7 @@ from rayfix_offline.rays.pathprior import PathPrior, fill_path_prior, reflection
 from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments
 from rayfix_tables.freespace import FreeSpace
-from tests.support.shapes import box
+from tests.support.scenes.shapes import box
 
 Launch = Callable[..., Segments]
 STATION = np.array([1.0, 1.0, 1.0])

@@ -15,7 +15,7 @@ from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments
 from rayfix_offline.rays.settings import RaySettings
 from rayfix_tables.freespace import FreeSpace
-from tests.support.rays import no_reflections
+from tests.support.oracles.rays import no_reflections
 
 Launch = Callable[..., Segments]
 Kind = Literal["power", "uniform", "paper"]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.scene.scene import Scene, load_scene
 from rayfix_tables.errors import SceneError
-from tests.support.refusals import refusal
+from tests.support.messages.refusals import refusal
 
 SINGLE = 1e-5  # m; PLY files of trimesh store single precision
 

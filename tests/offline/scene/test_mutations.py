@@ -9,9 +9,9 @@ import pytest
 
 from rayfix_offline.scene.scene import Scene, load_scene
 from rayfix_tables.errors import SceneError
-from tests.support import naive_scenes
-from tests.support.polygon_scene import volume
-from tests.support.scene_edits import FORMATS
+from tests.support.scenes import naive_scenes
+from tests.support.scenes.polygon_scene import volume
+from tests.support.scenes.scene_edits import FORMATS
 
 HAS_IFC = importlib.util.find_spec("ifcopenshell") is not None
 KINDS = [

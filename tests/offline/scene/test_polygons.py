@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rayfix_offline.scene.polygons import Triangles, cut_polygons
-from tests.support.polygon_scene import PARTITION_VOLUME, indexed, partition, volume
+from tests.support.scenes.polygon_scene import PARTITION_VOLUME, indexed, partition, volume
 
 WALL = [(0, 0), (2.5, 0), (2.5, 2.1), (3.5, 2.1), (3.5, 0), (6, 0), (6, 3), (0, 3)]
 COMB = [(0, 0), (9, 0), (9, 4), (8, 4), (8, 1), (6, 1), (6, 4), (5, 4), (5, 1), (3, 1), (3, 4), (2, 4), (2, 1), (0, 1)]

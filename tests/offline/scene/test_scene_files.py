@@ -14,7 +14,7 @@ from trimesh.visual.material import PBRMaterial
 
 from rayfix_offline.scene.scene import FILE_TYPES, METRES_PER_UNIT, Scene, load_scene
 from rayfix_tables.errors import SceneError
-from tests.support.refusals import refusal
+from tests.support.messages.refusals import refusal
 
 SINGLE = 1e-6  # m; most formats store single precision, and the room is 5 m long
 KINDS = [kind for kind in FILE_TYPES if kind not in ("gltf", "xml", "ifc")]

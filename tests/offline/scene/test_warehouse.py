@@ -10,7 +10,7 @@ from rayfix_offline.build import build_table
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin.twin import Twin, prepare_twin, refuse_errors
 from rayfix_tables.table import Table
-from tests.support.sites import stations_text
+from tests.support.scenes.sites import stations_text
 
 POSITIONS = [(-4.3, -9.9, 4.5), (6.5, -9.5, 4.5), (-4.3, 0.0, 5.0), (6.5, 0.0, 5.0), (-6.5, 9.5, 4.5), (6.5, 9.5, 4.0)]
 IN_A_RACK = (-6.0, 0.0, 4.0)

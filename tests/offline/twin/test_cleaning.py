@@ -12,8 +12,8 @@ from rayfix_offline.scene.scene import Scene
 from rayfix_offline.twin.cleaning import find_duplicates
 from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.solids import split_parts
-from tests.support.rooms import scene_of, twin_of
-from tests.support.shapes import box
+from tests.support.scenes.rooms import scene_of, twin_of
+from tests.support.scenes.shapes import box
 
 WriteSite = Callable[..., Path]
 

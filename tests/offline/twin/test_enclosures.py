@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from rayfix_offline.twin.enclosures import find_enclosures
 from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.solids import split_parts
-from tests.support.rooms import scene_of, twin_of
-from tests.support.shapes import box
+from tests.support.scenes.rooms import scene_of, twin_of
+from tests.support.scenes.shapes import box
 
 WriteSite = Callable[..., Path]
 Point = tuple[float, float, float]

@@ -23,7 +23,7 @@ from rayfix_offline.check import check_site
 from rayfix_offline.site import read_site
 from rayfix_offline.twin.findings import Finding
 from rayfix_offline.twin.twin import prepare_twin
-from tests.support.sites import stations_text
+from tests.support.scenes.sites import stations_text
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 

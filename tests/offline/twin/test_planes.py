@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rayfix_offline.twin.planes import Planes, merge_coplanar
 from rayfix_offline.twin.settings import TwinSettings
-from tests.support.shapes import box, cut_in_three, quad
+from tests.support.scenes.shapes import box, cut_in_three, quad
 
 EXACT = 1e-12  # m, of coordinates of a few metres
 

@@ -16,8 +16,8 @@ from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.solids import Part, is_inside, map_free_space, split_parts, touched
 from rayfix_tables.freespace import FreeSpace
-from tests.support.rooms import scene_of
-from tests.support.shapes import box
+from tests.support.scenes.rooms import scene_of
+from tests.support.scenes.shapes import box
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -15,8 +15,8 @@ from rayfix_offline.twin.planes import Planes, merge_coplanar
 from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.surfaces import join_facets
 from rayfix_offline.twin.topology import number_rows
-from tests.support.rooms import scene_of
-from tests.support.shapes import box
+from tests.support.scenes.rooms import scene_of
+from tests.support.scenes.shapes import box
 
 Triangles = NDArray[np.float64]
 

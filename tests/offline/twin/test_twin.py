@@ -11,7 +11,7 @@ import trimesh
 
 from rayfix_offline.twin.twin import Twin, refuse_errors
 from rayfix_tables.errors import SceneError
-from tests.support.rooms import twin_of
+from tests.support.scenes.rooms import twin_of
 
 WriteSite = Callable[..., Path]
 Stations = list[dict[str, Any]]

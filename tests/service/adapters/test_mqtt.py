@@ -25,7 +25,7 @@ from rayfix_service.adapters.silabs_stream import SilabsStream
 from rayfix_service.fusion.measurements.report import Height
 from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
-from tests.support.mqtt_broker import MESSAGE, TAG, Mosquitto, angles, broker_in, exchange, locating
+from tests.support.running.mqtt_broker import MESSAGE, TAG, Mosquitto, angles, broker_in, exchange, locating
 
 STATIONS: dict[str, str] = MESSAGE["stations"]
 # A table of four stations and three locators: a packet waits for the fourth.

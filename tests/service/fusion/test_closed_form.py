@@ -21,9 +21,9 @@ from rayfix_service.locator import Locator
 from rayfix_tables.errors import ReportError
 from rayfix_tables.geometry.angles import direction
 from rayfix_tables.site import Station, StationBias
-from tests.support.gaussian_oracle import Posterior, oracle
-from tests.support.hand_reports import EXACT, TUBES, angle_of, differences, measured, report_of
-from tests.support.hand_tables import GRID, POSITIONS, UE, MakeTable, line_of_sight
+from tests.support.messages.hand_reports import EXACT, TUBES, angle_of, differences, measured, report_of
+from tests.support.oracles.gaussian_oracle import Posterior, oracle
+from tests.support.tables.hand_tables import GRID, POSITIONS, UE, MakeTable, line_of_sight
 
 
 def assert_equal(fix: Fix, expected: Posterior) -> None:

@@ -33,7 +33,7 @@ from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
 from rayfix_tables.geometry.angles import angles_of, direction, local_to_scene
 from rayfix_tables.table import Table
-from tests.support import kernel_twins
+from tests.support.oracles import kernel_twins
 
 Array = NDArray[np.float64]
 

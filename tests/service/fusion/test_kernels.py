@@ -33,7 +33,7 @@ from rayfix_tables.level import WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture, pack, unpack
 from rayfix_tables.part import StationPart
 from rayfix_tables.site import Station
-from tests.support import kernel_twins
+from tests.support.oracles import kernel_twins
 
 Array = NDArray[np.float64]
 Times = tuple[NDArray[np.int64], Array, Array]

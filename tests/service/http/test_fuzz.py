@@ -20,7 +20,7 @@ from rayfix_service.http.openapi.examples import (
 from rayfix_service.server.app import create_app
 from rayfix_service.server.openapi import openapi_text
 from tests.support.checkout import ROOT
-from tests.support.server_process import start_server
+from tests.support.running.server_process import start_server
 
 DOCUMENT = ROOT / "docs" / "openapi.json"
 

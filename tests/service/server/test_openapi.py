@@ -16,8 +16,8 @@ from rayfix_service.http.openapi.examples import (
     SILABS_EXAMPLES,
     UBLOX_EXAMPLES,
 )
-from tests.support.reports import changed
-from tests.support.running_app import RunningApp
+from tests.support.messages.reports import changed
+from tests.support.running.running_app import RunningApp
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import pytest
 
 from rayfix_service.http.access.keys import add_key
 from rayfix_service.http.access.prefix import is_prefix
-from tests.support.reports import REPORT
-from tests.support.running_app import RunningApp
+from tests.support.messages.reports import REPORT
+from tests.support.running.running_app import RunningApp
 
 
 def servers(app: RunningApp, path: str = "/openapi.json", **headers: str) -> list[dict[str, str]]:

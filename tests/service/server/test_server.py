@@ -22,8 +22,8 @@ from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.telemetry.metrics import MULTIPROCESS_VARIABLE
 from rayfix_service.server.server import check_address, is_loopback, serve
 from rayfix_tables.errors import NotATableError, TableError
-from tests.support.reports import REPORT
-from tests.support.server_process import start_server
+from tests.support.messages.reports import REPORT
+from tests.support.running.server_process import start_server
 
 
 def wide_report() -> dict[str, Any]:

@@ -20,9 +20,9 @@ import pytest
 
 from rayfix_service.http.access.keys import add_key
 from rayfix_service.http.answering.served_tables import file_state, forget_changed, load_tables
-from tests.support.reports import REPORT
-from tests.support.server_process import start_server
-from tests.support.talking_process import TalkingProcess
+from tests.support.messages.reports import REPORT
+from tests.support.running.server_process import start_server
+from tests.support.running.talking_process import TalkingProcess
 
 RUN = """\
     import os, sys, time

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from rayfix_offline.build import build_table
-from tests.support.rooms import room_with_crate
-from tests.support.running_app import RunningApp
-from tests.support.sites import stations_text
+from tests.support.running.running_app import RunningApp
+from tests.support.scenes.rooms import room_with_crate
+from tests.support.scenes.sites import stations_text
 
 SITE = """\
 [site]

@@ -26,7 +26,7 @@ from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.mixture import TubeMixture
 from rayfix_tables.scene import Scene
 from rayfix_tables.table import Table
-from tests.support.running_app import RunningApp
+from tests.support.running.running_app import RunningApp
 
 DEGREE = math.pi / 180.0
 

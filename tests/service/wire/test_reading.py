@@ -23,7 +23,7 @@ from rayfix_service.fusion.measurements.report import (
 from rayfix_service.http.openapi.examples import BATCH_EXAMPLES, REPORT_EXAMPLES
 from rayfix_service.wire import InvalidReportError, parse_report
 from tests.support.checkout import ROOT
-from tests.support.measurements import AOA, PT, RSSI, TDOA, TOA, report_with
+from tests.support.messages.measurements import AOA, PT, RSSI, TDOA, TOA, report_with
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
 

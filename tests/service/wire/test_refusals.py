@@ -18,7 +18,7 @@ from rayfix_service.wire import (
     problems_of,
 )
 from rayfix_tables.errors import ReportError
-from tests.support.measurements import AOA, PT, RSSI, TDOA, TOA, report_with
+from tests.support.messages.measurements import AOA, PT, RSSI, TDOA, TOA, report_with
 
 M0 = ("measurements", 0)
 

@@ -7,9 +7,17 @@ import pytest
 
 from rayfix_offline.scene.scene import Scene, load_scene
 from rayfix_tables.errors import SceneError
-from tests.support.collada_files import document, geometry, input_of, polygons_of, polylist, source_of, triangles_of
-from tests.support.polygon_scene import PARTITION_VOLUME, hall, partition
-from tests.support.refusals import refusal
+from tests.support.messages.refusals import refusal
+from tests.support.scenes.collada_files import (
+    document,
+    geometry,
+    input_of,
+    polygons_of,
+    polylist,
+    source_of,
+    triangles_of,
+)
+from tests.support.scenes.polygon_scene import PARTITION_VOLUME, hall, partition
 
 NODE = '<node id="wall"><instance_geometry url="#wall"/></node>'
 SOURCE, RINGS = source_of("wall", partition())

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from rayfix_offline.scene.scene import Scene, load_scene
 from rayfix_tables.errors import SceneError
-from tests.support.gltf_files import GltfFile, box_arrays
-from tests.support.refusals import refusal
+from tests.support.messages.refusals import refusal
+from tests.support.scenes.gltf_files import GltfFile, box_arrays
 
 LOW, HIGH = (1.0, 2.0, 0.0), (2.0, 4.0, 3.0)
 VOLUME = 6.0

@@ -9,8 +9,8 @@ from rayfix_offline.scene.scene import load_scene
 from rayfix_offline.site import read_site
 from rayfix_offline.twin.twin import prepare_twin
 from rayfix_tables.errors import SceneError
-from tests.support.polygon_scene import FREE_VOLUME, Polygon, hall, partition
-from tests.support.refusals import refusal
+from tests.support.messages.refusals import refusal
+from tests.support.scenes.polygon_scene import FREE_VOLUME, Polygon, hall, partition
 
 SITE = '[site]\nname = "a"\nscene = "{}"\n[[stations]]\nid = "s"\nposition_m = [0.4, 0.4, 2.6]\n'
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"

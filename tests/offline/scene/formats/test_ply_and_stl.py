@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from rayfix_offline.scene.scene import load_scene
 from rayfix_tables.errors import SceneError
-from tests.support.polygon_scene import PARTITION_VOLUME, indexed, partition
-from tests.support.refusals import refusal
+from tests.support.messages.refusals import refusal
+from tests.support.scenes.polygon_scene import PARTITION_VOLUME, indexed, partition
 
 FORMATS = ["ascii", "binary_little_endian", "binary_big_endian"]
 

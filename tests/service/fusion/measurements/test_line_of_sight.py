@@ -14,9 +14,9 @@ from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.product.station_mixture import StationMixtures, is_direct
 from rayfix_service.locator import Locator
 from rayfix_tables.table import Table
-from tests.support.hand_reports import EXACT, angle_of
-from tests.support.hand_tables import POSITIONS, UE, MakeTable, Tube, line_of_sight
-from tests.support.running_app import RunningApp
+from tests.support.messages.hand_reports import EXACT, angle_of
+from tests.support.running.running_app import RunningApp
+from tests.support.tables.hand_tables import POSITIONS, UE, MakeTable, Tube, line_of_sight
 
 APART = np.array([0.0, 12.0, 0.0])
 LENGTH = float(np.linalg.norm(UE - np.array(POSITIONS["a"])))

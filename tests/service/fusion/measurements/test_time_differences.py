@@ -16,9 +16,9 @@ from rayfix_service.fusion.measurements.report import (
 )
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.locator import Locator
-from tests.support.gaussian_oracle import Product
-from tests.support.hand_reports import EXACT, TUBES, differences, measured, report_of
-from tests.support.hand_tables import MakeTable
+from tests.support.messages.hand_reports import EXACT, TUBES, differences, measured, report_of
+from tests.support.oracles.gaussian_oracle import Product
+from tests.support.tables.hand_tables import MakeTable
 
 
 @pytest.mark.parametrize("offset", [2.0**20, -(2.0**26), 0.0])

@@ -19,7 +19,7 @@ from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import uniform_prior
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.normal_points import normal_points
-from tests.support import kernel_twins
+from tests.support.oracles import kernel_twins
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from rayfix_service.fusion.posterior.cut_by_walls import cut_to_free_space
 from rayfix_service.fusion.stopping import NEVER
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.normal_points import unit_points
-from tests.support import kernel_twins
+from tests.support.oracles import kernel_twins
 
 Array = NDArray[np.float64]
 

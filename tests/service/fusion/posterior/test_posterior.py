@@ -15,7 +15,7 @@ from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_pri
 from rayfix_service.locator import Locator
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Table
-from tests.support import kernel_twins
+from tests.support.oracles import kernel_twins
 
 Array = NDArray[np.float64]
 

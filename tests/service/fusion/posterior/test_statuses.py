@@ -8,8 +8,8 @@ import pytest
 from rayfix_service.fusion.measurements.report import Measurement
 from rayfix_service.locator import Locator
 from rayfix_tables.geometry.angles import angles_of
-from tests.support.hand_reports import angle_of, report_of
-from tests.support.hand_tables import POSITIONS, SIDE, UE, MakeTable, line_of_sight
+from tests.support.messages.hand_reports import angle_of, report_of
+from tests.support.tables.hand_tables import POSITIONS, SIDE, UE, MakeTable, line_of_sight
 
 
 def test_two_symmetric_rooms_are_ambiguous(make_table: MakeTable) -> None:

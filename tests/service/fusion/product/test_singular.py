@@ -24,8 +24,8 @@ from rayfix_service.fusion.stopping import NEVER
 from rayfix_service.locator import Locator
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.cholesky import cholesky
-from tests.support.hand_reports import angle_of, report_of
-from tests.support.hand_tables import MakeTable, line_of_sight
+from tests.support.messages.hand_reports import angle_of, report_of
+from tests.support.tables.hand_tables import MakeTable, line_of_sight
 
 Array = NDArray[np.float64]
 

@@ -21,9 +21,9 @@ from rayfix_service.http.access.keys import ApiKeys, add_key
 from rayfix_service.http.access.rates import RateLimit
 from rayfix_service.http.errors import ServiceError
 from rayfix_service.locator import Locator
-from tests.support.reports import REPORT
-from tests.support.running_app import RunningApp
-from tests.support.server_process import start_server
+from tests.support.messages.reports import REPORT
+from tests.support.running.running_app import RunningApp
+from tests.support.running.server_process import start_server
 
 RANGES = {"measurements": [{"type": "pt", "station_id": "bs1", "range_m": 7.8, "stdev_m": 0.5}]}
 

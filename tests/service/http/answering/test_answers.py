@@ -14,9 +14,9 @@ from rayfix_service.http.answering.locating import Answerer, Incoming
 from rayfix_service.http.problems import Problem
 from rayfix_service.wire import FixDocument
 from rayfix_tables.table import Table
-from tests.support.measurements import TDOA, TOA
-from tests.support.reports import REPORT, changed
-from tests.support.running_app import RunningApp
+from tests.support.messages.measurements import TDOA, TOA
+from tests.support.messages.reports import REPORT, changed
+from tests.support.running.running_app import RunningApp
 
 AOA, PT = REPORT["measurements"]
 

@@ -22,10 +22,10 @@ from rayfix_service.fusion.measurements.report import Height
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.server.app import create_app
 from rayfix_tables.site import SiteInfo, Station
-from tests.support.mqtt_broker import MESSAGE, TAG, Mosquitto, angles, broker_in, exchange
-from tests.support.reports import REPORT
-from tests.support.running_app import serving, until_ready
-from tests.support.server_process import start_server
+from tests.support.messages.reports import REPORT
+from tests.support.running.mqtt_broker import MESSAGE, TAG, Mosquitto, angles, broker_in, exchange
+from tests.support.running.running_app import serving, until_ready
+from tests.support.running.server_process import start_server
 
 STATIONS: dict[str, str] = MESSAGE["stations"]
 

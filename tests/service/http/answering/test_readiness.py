@@ -9,9 +9,9 @@ import pytest
 from rayfix_service.locator import Locator
 from rayfix_service.server.server import serve
 from rayfix_tables.errors import TableError
-from tests.support.damage import flip_a_bit
-from tests.support.problems import problem_of
-from tests.support.running_app import RunningApp
+from tests.support.messages.problems import problem_of
+from tests.support.running.running_app import RunningApp
+from tests.support.tables.damage import flip_a_bit
 
 
 def test_alive_at_once_and_ready_later(hall_table_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -12,10 +12,10 @@ import pytest
 
 from rayfix_service.server.server import serve
 from rayfix_tables.errors import TableError
-from tests.support.damage import flip_a_bit
-from tests.support.reports import REPORT
-from tests.support.running_app import RunningApp
-from tests.support.table_edits import change_site, sign
+from tests.support.messages.reports import REPORT
+from tests.support.running.running_app import RunningApp
+from tests.support.tables.damage import flip_a_bit
+from tests.support.tables.table_edits import change_site, sign
 
 POLL = 0.05  # s
 

@@ -18,8 +18,8 @@ from rayfix_service.http.openapi.examples import SILABS_EXAMPLES
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.server.app import create_app
 from rayfix_service.wire import FixDocument
-from tests.support.reports import REPORT
-from tests.support.running_app import serving, until_ready
+from tests.support.messages.reports import REPORT
+from tests.support.running.running_app import serving, until_ready
 
 SETTINGS = ServiceSettings()
 

@@ -8,8 +8,8 @@ import pytest
 
 from rayfix_service.http.openapi.examples import BATCH_EXAMPLES, NRPPA_EXAMPLES, SILABS_EXAMPLES, UBLOX_EXAMPLES
 from rayfix_service.http.openapi.responses import AdaptedFixDocument, Local3dPointUncertaintyEllipsoid, OmloxLocation
-from tests.support.reports import REPORT
-from tests.support.running_app import RunningApp
+from tests.support.messages.reports import REPORT
+from tests.support.running.running_app import RunningApp
 
 NRPPA = NRPPA_EXAMPLES["ul_aoa_and_ul_rtoa"]["value"]
 SILABS = SILABS_EXAMPLES["three_locators"]["value"]

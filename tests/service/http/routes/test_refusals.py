@@ -11,10 +11,10 @@ import pytest
 
 from rayfix_service.http.settings import BodyLimits
 from rayfix_service.locator import Locator
-from tests.support.measurements import TDOA
-from tests.support.problems import problem_of
-from tests.support.reports import REPORT, changed
-from tests.support.running_app import RunningApp
+from tests.support.messages.measurements import TDOA
+from tests.support.messages.problems import problem_of
+from tests.support.messages.reports import REPORT, changed
+from tests.support.running.running_app import RunningApp
 
 REFUSED: dict[str, tuple[Any, int, str, list[str]]] = {
     # name: document or bytes, status, path, what the detail must say

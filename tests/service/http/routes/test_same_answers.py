@@ -11,9 +11,9 @@ import pytest
 
 from rayfix_service.http.openapi.examples import REPORT_EXAMPLES
 from rayfix_service.http.settings import BodyLimits
-from tests.support.measurements import TDOA
-from tests.support.reports import REPORT, changed
-from tests.support.running_app import JSON, RunningApp
+from tests.support.messages.measurements import TDOA
+from tests.support.messages.reports import REPORT, changed
+from tests.support.running.running_app import JSON, RunningApp
 
 JSON_BODIES: dict[str, Any] = {
     **{name: example["value"] for name, example in REPORT_EXAMPLES.items()},

@@ -23,8 +23,8 @@ from rayfix_service.http.openapi.examples import (
 )
 from rayfix_service.http.routes.stream import FixEventDocument
 from rayfix_service.wire import FixDocument, parse_report
-from tests.support.reports import REPORT
-from tests.support.server_process import ServerProcess, start_server
+from tests.support.messages.reports import REPORT
+from tests.support.running.server_process import ServerProcess, start_server
 
 
 @pytest.fixture(scope="module")

@@ -37,8 +37,8 @@ from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table
 from tests.support.checkout import ROOT
-from tests.support.reports import REPORT
-from tests.support.running_app import RunningApp
+from tests.support.messages.reports import REPORT
+from tests.support.running.running_app import RunningApp
 
 SITE = SiteInfo(name="site", north=0.0, max_path_length=100.0, stations=(Station(id="a", position=(0.0, 0.0, 0.0)),))
 

@@ -1,0 +1,1 @@
+"""Reports and other messages, and what is refused of them."""

@@ -1,0 +1,1 @@
+"""Services, brokers and disks that tests run against."""
