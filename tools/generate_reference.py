@@ -41,7 +41,7 @@ deviations can be worth, the widest what is quick, and what lies between saves t
 | base stations with many antennas; arrays after calibration | 0.1 to 1 deg | `[1.25, 5, 15]`, the default |
 | the same, beside coarse ones | 0.1 to 12 deg | `[1.25, 5, 15]` |
 | Silicon Labs arrays, in the open | 1 to 2 deg | `[2.5, 10]` |
-| u-blox anchors (5 deg is assumed), arrays among reflections | 4 to 12 deg | `[5, 15]` |
+| u-blox anchors (10 deg is assumed), arrays among reflections | 4 to 12 deg | `[5, 15]` |
 | times alone (UWB, RTOA) | none | `[5, 15]`: components of all directions are merged anyway |
 
 Cells are built at the finest window only; wider ones are sums of them. The number of the finest cells falls with its
