@@ -133,8 +133,8 @@ def _lines() -> Iterator[Show]:
     def write() -> None:
         while not ended.wait(_LINE_SECONDS):
             stage, done, total = latest
-            share = f" {done / total:.0%}" if total else ""
-            print(f"{stage}{share}, {_clock(time.monotonic() - begin)}", file=sys.stderr, flush=True)
+            fraction = f" {done / total:.0%}" if total else ""
+            print(f"{stage}{fraction}, {_clock(time.monotonic() - begin)}", file=sys.stderr, flush=True)
 
     writer = threading.Thread(target=write, daemon=True)
     writer.start()
