@@ -305,7 +305,7 @@ def _summary(station_id: str, built: BuiltStation) -> StationSummary:
         largest_change=part.update.largest_change if part.update else 0.0,
         num_components=sum(len(level.mixture) for level in part.levels),
         num_dropped_components=built.num_dropped,
-        num_bytes=sum(level.num_bytes for level in part.levels),
+        num_bytes=part.num_bytes,
         lost_ray_share=part.lost_ray_share,
         coverage=part.coverage,
     )

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.level import Level
+from rayfix_tables.paths import PathMap
 from rayfix_tables.site import Station
 
 
@@ -59,6 +60,8 @@ class StationPart:
         part.
     update : Update, optional
         For a part with cells that a new build would fit slightly differently.
+    paths : PathMap, optional
+        Tables of format versions 1 and 2 have none.
     """
 
     station: Station
@@ -67,3 +70,9 @@ class StationPart:
     coverage: tuple[float, ...]
     part_id: str = ""
     update: Update | None = None
+    paths: PathMap | None = None
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of the part's arrays in the file."""
+        return sum(level.num_bytes for level in self.levels) + (self.paths.num_bytes if self.paths else 0)

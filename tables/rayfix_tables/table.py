@@ -1,6 +1,7 @@
 """Read table files. The arrays are mapped, not read: workers that serve one table share its pages."""
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,11 +15,13 @@ from rayfix_tables.disk.files import open_table_file
 from rayfix_tables.disk.layout import FileLayout, damage_reported, read_layout
 from rayfix_tables.disk.schema import (
     LEVEL_DATASETS,
+    PATH_DATASETS,
     SCENE_DATASETS,
     array_digest,
     content_id,
     content_of,
     level_path,
+    paths_path,
     read_bias,
     read_mounting,
 )
@@ -28,6 +31,7 @@ from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import UNBALANCED, Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 from rayfix_tables.part import StationPart, Update
+from rayfix_tables.paths import PathMap
 from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
 
@@ -122,6 +126,7 @@ class Table:
                 coverage=_row(attributes["coverage"]),
                 part_id=_text(attributes["part_id"]),
                 update=_read_update(station_id, layout, levels, mapped),
+                paths=_read_paths(station_id, layout, mapped, scene.free_space),
             )
         return cls(
             path=path,
@@ -247,6 +252,40 @@ def _read_update(
         former_part_id=_text(attributes["former_part_id"]),
         tolerance=_finite(attributes["update_tolerance"]),
         cell_change=changes,
+    )
+
+
+def _read_paths(
+    station_id: str, layout: FileLayout, mapped: NDArray[np.uint8], free_space: FreeSpace
+) -> PathMap | None:
+    group = paths_path(station_id)
+    if group not in layout.attributes:
+        return None
+    attributes = layout.attributes[group]
+    arrays = {name: layout.array(f"{group}/{name}", mapped) for name in PATH_DATASETS}
+    voxel_size = _positive(attributes["voxel_size_m"], f"voxel_size_m of {group}")
+    refinement = max(1, round(voxel_size / free_space.voxel_size))
+    shape = tuple((-(-np.array(free_space.free.shape) // refinement)).tolist())
+    if _row(attributes["shape"]) != shape:
+        raise ValueError(f"{group} is not a map of the free space")
+    count, num_sequences = len(arrays["sequence"]), len(arrays["images"])
+    shapes: dict[str, tuple[int, ...]] = {
+        "offsets": (math.prod(shape) + 1,),
+        "weight": (count,),
+        "images": (num_sequences, 3),
+        "mirrors": (num_sequences, 3, 3),
+        "num_reflections": (num_sequences,),
+    }
+    for name, expected in shapes.items():
+        if arrays[name].shape != expected:
+            raise ValueError(f"{group}/{name} has the shape {arrays[name].shape}, not {expected}")
+    check_offsets(f"{group}/offsets", arrays["offsets"], count)
+    check_range(f"{group}/sequence", arrays["sequence"], 0, num_sequences - 1)
+    return PathMap(
+        origin=np.array(_triple(attributes["origin_m"])),
+        voxel_size=voxel_size,
+        shape=shape,
+        **arrays,
     )
 
 

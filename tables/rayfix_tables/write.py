@@ -18,12 +18,14 @@ from rayfix_tables.disk.ownership import own_file, remove_abandoned, try_lock
 from rayfix_tables.disk.schema import (
     FORMAT,
     FORMAT_VERSION,
+    PATH_DATASETS,
     array_digest,
     bias_attributes,
     content_attributes,
     content_id,
     dataset_paths,
     level_path,
+    paths_path,
     read_text,
     write_text,
 )
@@ -31,6 +33,7 @@ from rayfix_tables.errors import RayfixError, TableError
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES
 from rayfix_tables.part import StationPart, Update
+from rayfix_tables.paths import PathMap
 from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
 
@@ -192,13 +195,13 @@ def _write_content(
     software_version: str,
     progress: Callable[[int, int], None],
 ) -> str:
-    total, done = sum(level.num_bytes for part in parts for level in part.levels), 0
+    total, done = sum(part.num_bytes for part in parts), 0
     progress(done, total)
     _write_json(file, "site", _site_document(site))
     _write_scene(file, scene)
     for part in parts:
         _write_part(file, part, scene.origin)
-        done += sum(level.num_bytes for level in part.levels)
+        done += part.num_bytes
         progress(done, total)
     file.attrs["format_version"] = FORMAT_VERSION
     for name, text in (("format", FORMAT), ("software_version", software_version), ("scene_sha256", scene.sha256)):
@@ -226,6 +229,8 @@ def _write_part(file: h5py.File, part: StationPart, origin: NDArray[np.float64])
         _write_level(file.create_group(level_path(station.id, n)), level)
     if part.update is not None:
         _write_update(group, part.update)
+    if part.paths is not None:
+        _write_paths(file.create_group(paths_path(station.id)), part.paths)
 
 
 def _write_scene(file: h5py.File, scene: Scene) -> None:
@@ -252,6 +257,14 @@ def _write_level(group: h5py.Group, level: Level) -> None:
         _write(group, name, getattr(stored, name))
     if len(level.log_balance):
         _write(group, "log_balance", level.log_balance.astype(np.float32))
+
+
+def _write_paths(group: h5py.Group, paths: PathMap) -> None:
+    group.attrs["origin_m"] = paths.origin
+    group.attrs["voxel_size_m"] = paths.voxel_size
+    group.attrs["shape"] = np.array(paths.shape)
+    for name, (dtype, _) in PATH_DATASETS.items():
+        _write(group, name, getattr(paths, name).astype(dtype))
 
 
 def _write_update(group: h5py.Group, update: Update) -> None:

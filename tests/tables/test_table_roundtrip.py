@@ -18,6 +18,7 @@ from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
 from rayfix_tables.part import Update
+from rayfix_tables.paths import PATH_FIELDS, PathMap
 from rayfix_tables.site import NO_BIAS, Station
 from rayfix_tables.table import Table
 
@@ -46,6 +47,7 @@ def assert_same_table(table: Table, content: Any) -> None:
         assert vars(part.station.bias) == pytest.approx(vars(station.bias), rel=DEGREES)
         assert (part.lost_ray_share, part.coverage) == (written.lost_ray_share, written.coverage)
         assert table.levels(station.id) is part.levels
+        assert_same_paths(part.paths, written.paths if table.format_version >= 3 else None)
         for level, expected in zip(part.levels, written.levels, strict=True):
             assert level.window == pytest.approx(expected.window, rel=DEGREES)
             assert (level.num_cells, level.num_components) == (expected.grid.num_cells, len(expected.mixture))
@@ -64,6 +66,17 @@ def assert_same_table(table: Table, content: Any) -> None:
     assert_same_bits(table.scene.free_space.free, scene.free_space.free)
     assert_same_bits(table.scene.free_space.origin, scene.free_space.origin)
     assert table.scene.free_space.voxel_size == scene.free_space.voxel_size
+
+
+def assert_same_paths(actual: PathMap | None, expected: PathMap | None) -> None:
+    """Check a station's map of paths, which tables of former versions do not have."""
+    if actual is None or expected is None:
+        assert actual is expected
+        return
+    assert (actual.voxel_size, actual.shape) == (expected.voxel_size, expected.shape)
+    assert_same_bits(actual.origin, expected.origin)
+    for name in PATH_FIELDS:
+        assert_same_bits(getattr(actual, name), getattr(expected, name))
 
 
 @settings(max_examples=15, deadline=None)
@@ -168,6 +181,15 @@ def test_a_table_of_format_1_is_still_read(make_content: Callable[..., Any]) -> 
     assert_same_table(table, make_content(1, num_stations=1, num_levels=1))
     assert table.format_version == 1
     assert table.table_id == "4506b08f92814eda2c4c9d246dbb340c18f557041afaf38eb6bdc473c134eea3"
+    table.verify()
+
+
+def test_a_table_of_format_2_is_still_read(make_content: Callable[..., Any]) -> None:
+    """It has no map of paths."""
+    table = Table.open(Path(__file__).parent / "stored" / "format-2.h5")
+    assert_same_table(table, make_content(1, num_stations=1, num_levels=1))
+    assert table.format_version == 2
+    assert table.table_id == "0f8e18f4ac3affc58843f00b295cd47e17c823f437c4985cf99b51e077d87313"
     table.verify()
 
 

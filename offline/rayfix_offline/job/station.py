@@ -14,6 +14,7 @@ from rayfix_offline.job.previous_table import FormerStation, KeptCells
 from rayfix_offline.job.shards import ShardStore
 from rayfix_tables.level import Level
 from rayfix_tables.part import StationPart, Update
+from rayfix_tables.paths import PathMap
 
 StationProgress = Callable[[str, int], None]
 """Called with the stage and the number of the station's cells that are done."""
@@ -161,4 +162,5 @@ def _assemble(
         levels=tuple(level for level, _ in levels),
         lost_ray_share=float(launch["lost_ray_share"]),
         coverage=tuple(float(fraction) for fraction in launch["coverage"]),
+        paths=PathMap.from_arrays(launch),
     )

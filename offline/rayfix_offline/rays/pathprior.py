@@ -29,6 +29,8 @@ class PathPrior:
     voxel_size : float, m
     total : ndarray of shape (nx, ny, nz)
         Mean over the voxel's free part; 0 if no ray reaches it.
+    free_volume : ndarray of that shape, m3
+        Volume of the voxel's free part; one voxel of the free space at least.
     coverage : tuple of float
         Fraction of the free voxels that are reached with at most 0, 1, 2, ... reflections.
     """
@@ -36,6 +38,7 @@ class PathPrior:
     origin: NDArray[np.float64]
     voxel_size: float
     total: NDArray[np.float64]
+    free_volume: NDArray[np.float64]
     coverage: tuple[float, ...]
 
 
@@ -85,11 +88,17 @@ def fill_path_prior(
     gain = sum((total for total, _ in filled[1:]), start=filled[0][0])
     first_reached = np.min([reached for _, reached in filled], axis=0)
     # Rays reach only the free part of a voxel that a solid cuts; it counts as one free-space voxel at least.
-    total = gain / voxel_size**3 / np.maximum(free_fraction, 1.0 / refinement**3)
+    free_volume = voxel_size**3 * np.maximum(free_fraction, 1.0 / refinement**3)
     free = free_fraction > 0.5
     count = max(1, int(np.count_nonzero(free)))
     coverage = tuple(float(np.count_nonzero(free & (first_reached <= k)) / count) for k in range(depths))
-    return PathPrior(origin=free_space.origin, voxel_size=voxel_size, total=total, coverage=coverage)
+    return PathPrior(
+        origin=free_space.origin,
+        voxel_size=voxel_size,
+        total=gain / free_volume,
+        free_volume=free_volume,
+        coverage=coverage,
+    )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -1,6 +1,10 @@
 """Numbers that decide which rays are launched and how they are cut."""
 
 from dataclasses import dataclass
+from typing import Literal
+
+PathKind = Literal["power", "uniform", "paper"]
+"""Which path a station reports: strong ones preferred, any alike, or as in the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +29,8 @@ class RaySettings:
         Largest spacing of the rays that fill the path prior, at the far end of the scene, in voxels of its map.
     prior_spacing : float, rad
         Smallest spacing of rays that are launched for the path prior only.
+    least_path_share : float
+        The path map leaves out paths that carry less than this fraction of the sum of gain^beta at a place.
     """
 
     rays_per_window: float = 3.0
@@ -35,3 +41,4 @@ class RaySettings:
     prior_refinement: int = 2
     prior_rays: float = 0.7
     prior_spacing: float = 0.0073
+    least_path_share: float = 1e-3

@@ -2,11 +2,13 @@
 
 import hashlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.rays.launch import launch
+from rayfix_offline.rays.pathmap import FieldOfView, fill_path_map
 from rayfix_offline.rays.pathprior import fill_path_prior
 from rayfix_offline.rays.pieces import Pieces, cut_pieces
 from rayfix_offline.rays.rays import RaySet, sample_rays
@@ -16,7 +18,9 @@ from rayfix_offline.rays.surface_sequences import surface_sequences
 from rayfix_offline.scene.materials import ReflectionSettings, Reflectivity, constant_reflectivity, itu_reflectivity
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin.twin import Twin
+from rayfix_tables.geometry.mounting import board_to_scene
 from rayfix_tables.grid import AngularGrid
+from rayfix_tables.paths import PathMap
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,15 +57,18 @@ class StationTrace:
         Fraction of the rays that left the scene instead of hitting a surface.
     coverage : tuple of float
         Fraction of the free space that is reached with at most 0, 1, 2, ... reflections.
+    paths : PathMap
     """
 
     finest: LevelRays
     lost_ray_share: float
     coverage: tuple[float, ...]
+    paths: PathMap
 
-    def to_arrays(self) -> dict[str, NDArray[np.float64]]:
-        """Return the statistics of the launch as the arrays of a shard."""
-        return {"lost_ray_share": np.array(self.lost_ray_share), "coverage": np.array(self.coverage)}
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the statistics of the launch and the path map as the arrays of a shard."""
+        statistics = {"lost_ray_share": np.array(self.lost_ray_share), "coverage": np.array(self.coverage)}
+        return statistics | self.paths.to_arrays()
 
 
 def level_grid(window: float, *, cells_per_window: float = RaySettings.cells_per_window) -> AngularGrid:
@@ -159,7 +166,22 @@ def trace_station(
         sequences=segments.sequences,
         surface_sequences=surface_sequences(segments.sequences, twin.planes),
     )
-    return StationTrace(finest=finest, lost_ray_share=prior_segments.lost_ray_share, coverage=prior.coverage)
+    looks = station.station()
+    paths = fill_path_map(
+        prior_rays,
+        prior_segments,
+        prior,
+        exponent=exponent,
+        kind=site.propagation.path_prior,
+        least_share=settings.least_path_share,
+        field_of_view=FieldOfView(board_to_scene(looks)[:, 0], 0.5 * looks.field_of_view)
+        if looks.field_of_view < 2.0 * np.pi
+        else None,
+        jobs=jobs,
+    )
+    return StationTrace(
+        finest=finest, lost_ray_share=prior_segments.lost_ray_share, coverage=prior.coverage, paths=paths
+    )
 
 
 def launch_rays(

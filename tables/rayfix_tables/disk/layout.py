@@ -23,12 +23,13 @@ from rayfix_tables.disk.files import OpenFile
 from rayfix_tables.disk.schema import (
     CELL_CHANGE,
     FORMAT,
-    FORMAT_VERSION,
     LEVEL_DATASETS,
     LOG_BALANCE,
+    PATH_DATASETS,
     READ_VERSIONS,
     SCENE_DATASETS,
     TEXT_DATASETS,
+    TEXT_IN_HEAPS,
 )
 from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError, TableError
 
@@ -45,6 +46,7 @@ _OF_THE_SYSTEM = frozenset(
 """Errors of disks, networks and permissions, which do not depend on the file's content."""
 
 _STATION = re.compile(r"stations/[^/]+\Z")
+_PATHS = re.compile(r"stations/[^/]+/paths\Z")
 _LEVEL = re.compile(r"stations/[^/]+/levels/(0|[1-9][0-9]{0,3})\Z")
 _OF_SCENE = {**SCENE_DATASETS, **TEXT_DATASETS}
 _OF_LEVELS = {**LEVEL_DATASETS, "log_balance": LOG_BALANCE, "cell_change": CELL_CHANGE}
@@ -109,6 +111,8 @@ def dataset_kind(path: str) -> tuple[np.dtype[Any], int]:
         kind = _OF_SCENE[path]
     elif _LEVEL.match(group) and name in _OF_LEVELS:
         kind = _OF_LEVELS[name]
+    elif _PATHS.match(group) and name in PATH_DATASETS:
+        kind = PATH_DATASETS[name]
     else:
         raise ValueError(f"{shown(path)} does not belong to a table")
     return np.dtype(kind[0]), kind[1]
@@ -166,8 +170,9 @@ def read_layout(opened: OpenFile) -> FileLayout:
     # Opened by its descriptor, because another file may have its name now. Without a lock, which some file systems lack
     # and another program may hold; a table never changes in place.
     with h5py.File(f"/dev/fd/{opened.descriptor}", "r", locking=False) as file:
-        # Damaged texts in a heap can make HDF5 hang; files of this version must not have any.
-        reader = _Reader(size=opened.size, in_heaps=_whole_number(file, "format_version") != FORMAT_VERSION)
+        # Damaged texts in a heap can make HDF5 hang; files of later versions must not have any.
+        known = _whole_number(file, "format_version")
+        reader = _Reader(size=opened.size, in_heaps=known not in READ_VERSIONS or known == TEXT_IN_HEAPS)
         root = reader.attributes_of(file.id, "")
         if root.get("format") != FORMAT:
             raise NotATableError(
@@ -177,7 +182,7 @@ def read_layout(opened: OpenFile) -> FileLayout:
         if version not in READ_VERSIONS or isinstance(version, bool):
             raise FormatVersionError(
                 f"{path} has table format {version}, this rayfix reads formats "
-                f"{' and '.join(str(each) for each in READ_VERSIONS)}; build the table again with this version, or "
+                f"{READ_VERSIONS[0]} to {READ_VERSIONS[-1]}; build the table again with this version, or "
                 "install the version that wrote it"
             )
         reader.read_group(file["/"].id, "")
@@ -325,6 +330,7 @@ def _is_group(path: str) -> bool:
         path in ("scene", "stations")
         or _STATION.match(path) is not None
         or (path.endswith("/levels") and _STATION.match(path.removesuffix("/levels")) is not None)
+        or _PATHS.match(path) is not None
         or _LEVEL.match(path) is not None
     )
 

@@ -10,19 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
+from rayfix_tables.paths import PATH_FIELDS
 from rayfix_tables.site import NO_BIAS, Mounting, Station, StationBias
 
 FORMAT = "rayfix-table"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Version that is written."""
 
 TEXT_IN_HEAPS = 1
-"""Older version that is also read: its texts are attributes of variable length, stored in a heap of the file."""
+"""Oldest version that is also read: its texts are attributes of variable length, stored in a heap of the file."""
 
-READ_VERSIONS = (TEXT_IN_HEAPS, FORMAT_VERSION)
+READ_VERSIONS = (TEXT_IN_HEAPS, 2, FORMAT_VERSION)
 
 ARRAYS_VERSION = 1
-"""Version of the meaning of a part's arrays. It is the same in both format versions, which permits reuse of parts."""
+"""Version of the meaning of a part's arrays. It is the same in all format versions, which permits reuse of parts."""
 
 TEXT_DATASETS: dict[str, tuple[type[np.generic], int]] = {"site": (np.uint8, 1), "scene/materials": (np.uint8, 1)}
 """Type and number of axes of the datasets that hold JSON, in UTF-8."""
@@ -50,9 +51,18 @@ CELL_CHANGE: tuple[type[np.generic], int] = (np.float32, 1)
 """Type and number of axes of a level's ``cell_change``, which only updated parts have."""
 
 
+PATH_DATASETS = PATH_FIELDS
+"""Type and number of axes of the datasets of a station's path map, which tables have since version 3."""
+
+
 def level_path(station_id: str, level: int) -> str:
     """Path of a level's group in the file."""
     return f"stations/{station_id}/levels/{level}"
+
+
+def paths_path(station_id: str) -> str:
+    """Path of the group of a station's path map in the file."""
+    return f"stations/{station_id}/paths"
 
 
 def bias_attributes(bias: StationBias) -> dict[str, float]:

@@ -42,7 +42,9 @@ def traced(clutter: NDArray[np.float64], launch_in: Launch) -> Traced:
     """About 3,000 rays in the cluttered room, with two reflections."""
     rays = sample_rays(0.065, np.random.default_rng(0))
     segments = launch_in(clutter, (3.6, 0.4, 2.6), rays.directions, max_reflections=2)
-    prior = PathPrior(origin=np.zeros(3), voxel_size=1.0, total=np.ones((4, 5, 3)), coverage=(1.0,))
+    prior = PathPrior(
+        origin=np.zeros(3), voxel_size=1.0, total=np.ones((4, 5, 3)), free_volume=np.ones(1), coverage=(1.0,)
+    )
     pieces = cut_pieces(rays, segments, prior, exponent=1.0, kind="uniform", slice_ratio=1.35)
     return Traced(rays, pieces, segments.sequences)
 

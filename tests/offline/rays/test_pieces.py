@@ -25,7 +25,9 @@ RATIO = 1.35
 
 def prior_of(value: float) -> PathPrior:
     """Make a total that is the same everywhere."""
-    return PathPrior(origin=np.zeros(3), voxel_size=0.5, total=np.full((8, 10, 6), value), coverage=(1.0,))
+    return PathPrior(
+        origin=np.zeros(3), voxel_size=0.5, total=np.full((8, 10, 6), value), free_volume=np.ones(1), coverage=(1.0,)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +84,7 @@ def test_the_voxel_of_the_point_decides(rays: RaySet, segments: Segments, axis: 
     """Half of the room has four paths: with beta = 0 the weight is s^2 on one side of the middle, s^2 / 4 beyond."""
     total = np.ones((8, 10, 6))
     np.moveaxis(total, axis, 0)[total.shape[axis] // 2 :] = 4.0
-    prior = PathPrior(origin=np.zeros(3), voxel_size=0.5, total=total, coverage=(1.0,))
+    prior = PathPrior(origin=np.zeros(3), voxel_size=0.5, total=total, free_volume=np.ones(1), coverage=(1.0,))
     pieces = cut_pieces(rays, segments, prior, exponent=0.0, kind="power", slice_ratio=RATIO)
     sums = ray_sums(pieces, pieces.mass)
     sequences = segments.sequences

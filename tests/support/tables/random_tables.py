@@ -1,6 +1,6 @@
 """Small tables of random numbers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 from rayfix_tables.part import StationPart
+from rayfix_tables.paths import PathMap
 from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station, StationBias
 from rayfix_tables.write import write_table
@@ -33,6 +34,23 @@ def random_mixture(rng: np.random.Generator, count: int) -> TubeMixture:
     fields = {name: rng.normal(size=(count, *shape)).astype(np.float32) for name, shape in FIELD_SHAPES.items()}
     fields["num_reflections"] = rng.integers(0, 4, count).astype(np.int8)
     return TubeMixture(**fields)
+
+
+def random_paths(rng: np.random.Generator, free_space: FreeSpace) -> PathMap:
+    """Paths of no meaning to voxels of twice the size of the free space's."""
+    shape = tuple((-(-np.array(free_space.free.shape) // 2)).tolist())
+    counts, num_sequences = rng.integers(0, 4, int(np.prod(shape))), 5
+    return PathMap(
+        origin=free_space.origin,
+        voxel_size=2.0 * free_space.voxel_size,
+        shape=shape,
+        offsets=np.concatenate([[0], np.cumsum(counts)]),
+        sequence=rng.integers(0, num_sequences, int(counts.sum())).astype(np.int32),
+        weight=rng.random(int(counts.sum())).astype(np.float32),
+        images=rng.normal(size=(num_sequences, 3)),
+        mirrors=rng.normal(size=(num_sequences, 3, 3)),
+        num_reflections=rng.integers(0, 4, num_sequences).astype(np.int8),
+    )
 
 
 def random_content(
@@ -79,21 +97,23 @@ def random_content(
                 coverage=tuple(rng.random(3).tolist()),
             )
         )
+    site = SiteInfo(
+        name=f"site {seed}",
+        north=rng.uniform(-3, 3),
+        max_path_length=rng.uniform(1, 99),
+        stations=tuple(stations),
+        document={"site": {"name": "ß", "seed": seed}, "stations": [s.id for s in stations]},
+    )
+    scene = Scene(
+        vertices=rng.normal(size=(3 * num_faces, 3)),
+        faces=rng.integers(0, 3 * num_faces, (num_faces, 3)).astype(np.int32),
+        face_materials=rng.integers(-1, 2, num_faces).astype(np.int16),
+        materials=("itu_concrete", "itu_metal"),
+        free_space=FreeSpace(origin=rng.normal(size=3), voxel_size=0.1, free=rng.random((3, 4, 2)) < 0.5),
+        sha256=f"{seed:064x}",
+    )
     return Content(
-        site=SiteInfo(
-            name=f"site {seed}",
-            north=rng.uniform(-3, 3),
-            max_path_length=rng.uniform(1, 99),
-            stations=tuple(stations),
-            document={"site": {"name": "ß", "seed": seed}, "stations": [s.id for s in stations]},
-        ),
-        scene=Scene(
-            vertices=rng.normal(size=(3 * num_faces, 3)),
-            faces=rng.integers(0, 3 * num_faces, (num_faces, 3)).astype(np.int32),
-            face_materials=rng.integers(-1, 2, num_faces).astype(np.int16),
-            materials=("itu_concrete", "itu_metal"),
-            free_space=FreeSpace(origin=rng.normal(size=3), voxel_size=0.1, free=rng.random((3, 4, 2)) < 0.5),
-            sha256=f"{seed:064x}",
-        ),
-        parts=tuple(parts),
+        site=site,
+        scene=scene,
+        parts=tuple(replace(part, paths=random_paths(rng, scene.free_space)) for part in parts),
     )

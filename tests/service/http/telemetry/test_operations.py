@@ -33,6 +33,7 @@ from rayfix_service.http.telemetry.report_figures import report_outcome
 from rayfix_service.http.telemetry.request_context import ACCESS_LOGGER, REQUEST_ID, RequestContext
 from rayfix_service.http.telemetry.station_figures import MOST_STATIONS
 from rayfix_service.locator import Locator
+from rayfix_tables.disk.schema import FORMAT_VERSION
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table
@@ -253,7 +254,7 @@ def test_the_table_and_readiness_are_told(service: RunningApp, hall_table_path: 
     figures = figures_of(service)
     table = Table.open(hall_table_path)
     labels = ("2", "hall", table.software_version, "hall", table.table_id)
-    assert table.format_version == 2
+    assert table.format_version == FORMAT_VERSION
     assert figures["rayfix_table_info", *labels] == 1
     assert figures["rayfix_ready",] == 1
     assert figures["process_resident_memory_bytes",] > 1e6

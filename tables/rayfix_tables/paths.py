@@ -1,0 +1,82 @@
+"""The paths from a station to each place: which there are, and which of them the station reports."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+PATH_FIELDS: dict[str, tuple[type[np.generic], int]] = {
+    "offsets": (np.int64, 1),
+    "sequence": (np.int32, 1),
+    "weight": (np.float32, 1),
+    "images": (np.float64, 2),
+    "mirrors": (np.float64, 3),
+    "num_reflections": (np.int8, 1),
+}
+"""Type and number of axes of the arrays of a path map."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PathMap:
+    """Paths from one station to the voxels of a map.
+
+    A path of reflection sequence s to a position x has the length ``|x - image_s|``, the direction ``k`` of ``x -
+    image_s`` when it arrives, and left the station in the direction ``mirror_s' k``. This holds for any x; the voxels
+    tell only which sequences there are.
+
+    Attributes
+    ----------
+    origin : ndarray of shape (3,), m
+        Low corner of the map.
+    voxel_size : float, m
+    shape : tuple of 3 ints
+    offsets : ndarray of int64, shape (n_voxels + 1,)
+        The paths to voxel v, in C order, are those from ``offsets[v]`` to ``offsets[v + 1]``, heaviest first.
+    sequence : ndarray of int32, shape (n_paths,)
+    weight : ndarray of float32, shape (n_paths,)
+        Positive. With the path prior "power", it is the probability that the station reports this path, and those of a
+        voxel add up to 1.
+    images : ndarray of float64, shape (n_sequences, 3), m
+        Mirror images of the station.
+    mirrors : ndarray of float64, shape (n_sequences, 3, 3)
+        Turn a direction at the station into the one after the last reflection.
+    num_reflections : ndarray of int8, shape (n_sequences,)
+    """
+
+    origin: NDArray[np.float64]
+    voxel_size: float
+    shape: tuple[int, ...]
+    offsets: NDArray[np.int64]
+    sequence: NDArray[np.int32]
+    weight: NDArray[np.float32]
+    images: NDArray[np.float64]
+    mirrors: NDArray[np.float64]
+    num_reflections: NDArray[np.int8]
+
+    def __len__(self) -> int:
+        """Return the number of paths."""
+        return len(self.sequence)
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of the arrays in the file."""
+        return sum(getattr(self, name).nbytes for name in PATH_FIELDS)
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the map as arrays, by names that begin with ``paths_``."""
+        box = {"origin": self.origin, "voxel_size": np.array(self.voxel_size), "shape": np.array(self.shape)}
+        arrays = box | {name: getattr(self, name) for name in PATH_FIELDS}
+        return {f"paths_{name}": array for name, array in arrays.items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "PathMap":
+        """Restore a map from the arrays of :meth:`to_arrays`, among others."""
+        return cls(
+            origin=arrays["paths_origin"],
+            voxel_size=float(arrays["paths_voxel_size"]),
+            shape=tuple(arrays["paths_shape"].tolist()),
+            **{name: arrays[f"paths_{name}"] for name in PATH_FIELDS},
+        )
