@@ -14,7 +14,7 @@ from rayfix_service.fusion.measurements.checks import check_report
 from rayfix_service.fusion.measurements.report import Angle, Range, Report
 from rayfix_service.fusion.posterior.credible import CredibleRegions
 from rayfix_service.fusion.posterior.fix import Fix
-from rayfix_service.fusion.posterior.fixes import make_fix
+from rayfix_service.fusion.posterior.fixes import Product, make_fix
 from rayfix_service.fusion.posterior.fused import Fused
 from rayfix_service.fusion.posterior.points import DrawnPoints
 from rayfix_service.fusion.posterior.posterior import Posterior, make_posterior
@@ -70,7 +70,7 @@ class Locator:
             When it was stopped.
         """
         report = _read(report)
-        return self.explain(report, self._fused(report, stop).fix, stop=stop)
+        return self.explain(report, self._fix(report, self._fusion.product(report, stop), stop), stop=stop)
 
     def explain(self, report: Report, fix: Fix, *, stop: Stop = NEVER) -> Fix:
         """Search the stations of an inconsistent report for a constant turn of their angles, and warn of it.
@@ -136,12 +136,14 @@ class Locator:
             As of :meth:`locate`, and so are the errors.
         """
         report = _read(report)
-        fused = self._fused(report, stop)
+        product = self._fusion.product(report, stop)
+        fix = self._fix(report, product, stop)
+        hypotheses = likelihood = product.hypotheses
         if not with_likelihood:
-            return replace(fused, likelihood=None)
-        if report.height is None:
-            return fused
-        return replace(fused, likelihood=self._fusion.product(replace(report, height=None), stop).hypotheses)
+            likelihood = None
+        elif report.height is not None:
+            likelihood = self._fusion.product(replace(report, height=None), stop).hypotheses
+        return Fused(fix=fix, hypotheses=hypotheses, prior=product.prior, likelihood=likelihood)
 
     def posterior(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Posterior:
         """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.
@@ -186,12 +188,9 @@ class Locator:
         regions.upright_ellipsoid(0.5)
         _ = regions.accuracies(0.5).ellipsoid.semi_axes
 
-    def _fused(self, report: Report, stop: Stop) -> Fused:
-        product = self._fusion.product(report, stop)
+    def _fix(self, report: Report, product: Product, stop: Stop) -> Fix:
         fix = make_fix(report, product, self.table, self.settings, stop)
-        if fix.status == "inconsistent":
-            fix = replace(fix, warnings=(suspects(report, fix),))
-        return Fused(fix=fix, hypotheses=product.hypotheses, prior=product.prior, likelihood=product.hypotheses)
+        return replace(fix, warnings=(suspects(report, fix),)) if fix.status == "inconsistent" else fix
 
 
 def _read(report: Report | Mapping[str, Any]) -> Report:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-
 PATH_FIELDS: dict[str, tuple[type[np.generic], int]] = {
     "offsets": (np.int64, 1),
     "sequence": (np.int32, 1),

@@ -3,15 +3,20 @@
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fixes import Product
+from rayfix_service.fusion.posterior.summary import GaussianPosterior
 from rayfix_service.fusion.product.beam import multiply
 from rayfix_service.fusion.product.cost import CostEstimate
 from rayfix_service.fusion.product.factors import Factor, make_factor
 from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_prior
 from rayfix_service.fusion.product.station_mixture import StationMixtures
+from rayfix_service.fusion.quadrature.engine import Quadrature
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.site import SiteInfo
 from rayfix_tables.table import Table
+
+_MOST_MEASUREMENTS = 32
+"""A report of more measurements than this is not quick, without a closer estimate."""
 
 _NO_RAYS = "no ray of station '{}' comes from that direction"
 
@@ -26,6 +31,8 @@ _FEWER_HYPOTHESES = (
     "less probable hypotheses were left out, since there were too many products to form; send fewer measurements, or "
     "time differences that are connected"
 )
+
+_COARSER_GRID = "the position's surroundings were divided less finely, since there were too many parts"
 
 _SINGULAR = (
     "{} Gaussians were left out, since rounding made their covariances singular; give standard deviations that differ "
@@ -49,6 +56,7 @@ class Fusion:
         self._stations = {name: StationMixtures(part) for name, part in table.parts.items()}
         largest = max((part.levels[-1].num_components for part in table.parts.values()), default=0)
         self._most_considered = max(self.settings.most_considered, self.settings.considered_tables * largest)
+        self._quadrature = Quadrature(table, settings)
         self._cost = CostEstimate(self._stations, self.settings)
 
     def seconds(self, report: Report) -> float:
@@ -56,7 +64,8 @@ class Fusion:
 
         The estimate separates quick fixes from slow ones; it is infinite for a report that is slow in any case.
         """
-        return self._cost.seconds(report)
+        seconds = self._quadrature.seconds(report) if len(report.measurements) <= _MOST_MEASUREMENTS else None
+        return self._cost.seconds(report) if seconds is None else seconds
 
     def product(self, report: Report, stop: Stop = NEVER, *, site: SiteInfo | None = None) -> Product:
         """Multiply the likelihoods of the measurements of a report.
@@ -77,10 +86,27 @@ class Fusion:
             When it was stopped.
         """
         sorted_report = sort_report(report, site or self.table.site)
+        prior = self._prior(report)
+        if self._quadrature.suits(sorted_report):
+            return self._integrated(sorted_report, prior, stop)
+        return self._multiplied(sorted_report, prior, stop)
+
+    def _prior(self, report: Report) -> Prior:
         prior = self._uniform_prior
         if report.height is not None:
             scene = self.table.scene
             prior = height_prior(report.height, scene.free_space).raised(-float(scene.origin[2]))
+        return prior
+
+    def _integrated(self, sorted_report: SortedReport, prior: Prior, stop: Stop) -> Product:
+        """Integrate the posterior on the path map."""
+        observations = list(sorted_report.observations)
+        posterior = self._quadrature.posterior(observations, prior, stop)
+        simplified = (_COARSER_GRID,) if posterior.omitted else ()
+        return Product(observations, dict(sorted_report.unused), prior, posterior, simplified)
+
+    def _multiplied(self, sorted_report: SortedReport, prior: Prior, stop: Stop) -> Product:
+        """Multiply the Gaussians of the table's cells."""
         unused = dict(sorted_report.unused)
         observations, factors = self._factors(sorted_report, prior, unused, stop)
         hypotheses = None
@@ -101,7 +127,8 @@ class Fusion:
             simplified.append(_FEWER_HYPOTHESES)
         if hypotheses is not None and hypotheses.dropped:
             simplified.append(_SINGULAR.format(hypotheses.dropped))
-        return Product(observations, unused, prior, hypotheses, tuple(simplified))
+        posterior = None if hypotheses is None else GaussianPosterior(gaussians=hypotheses)
+        return Product(observations, unused, prior, posterior, tuple(simplified))
 
     def _factors(
         self, sorted_report: SortedReport, prior: Prior, unused: dict[int, str], stop: Stop

@@ -109,7 +109,7 @@ def _rays(report: Report, site: SiteInfo) -> _Rays:
         seen.add(measurement.station_id)
         station = site.station_by_id[measurement.station_id]
         found = to_scene(without_bias(measurement, station), station, site.north)
-        if found.azimuth is None or found.tilt is not None:
+        if found.azimuth is None or (found.zenith is None and found.local is not None):
             continue
         length = lengths.get(station.id)
         rows.append(

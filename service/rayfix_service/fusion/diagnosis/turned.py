@@ -161,7 +161,7 @@ def _single_turn(report: Report, site: SiteInfo, station_id: str, relocate: Relo
         return None
     station = site.station_by_id[station_id]
     measured = to_scene(without_bias(first, station), station, site.north)
-    if measured.azimuth is None or measured.tilt is not None:
+    if measured.azimuth is None or (measured.zenith is None and measured.local is not None):
         return None
     apart = others.position - np.array(station.position)
     azimuth, zenith = angles_of(apart)

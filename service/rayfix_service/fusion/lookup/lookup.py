@@ -96,10 +96,10 @@ def look_up(levels: tuple[Level, ...], measured: Direction) -> Lookup:
         if abs(correlation) > _LEAST_CORRELATION:
             ellipse = sum_of_ellipse(summed.grid, summed.window, measured.azimuth, measured.zenith, measured.cov)
             return Lookup(level=summed, **ellipse._asdict())
-    elif measured.azimuth is not None and measured.tilt is not None:
+    elif measured.azimuth is not None and measured.local is not None:
         stdev = float(np.sqrt(measured.cov[0, 0]))
         level = next((level for level in levels if level.window >= max(_MERIDIAN_WINDOW, stdev)), levels[-1])
-        meridian = sum_of_meridian(level.grid, level.window, measured.azimuth, stdev, measured.tilt)
+        meridian = sum_of_meridian(level.grid, level.window, measured.azimuth, stdev, measured.local.to_scene)
         return Lookup(level=level, **meridian._asdict())
     return _cell_sum(summed, measured)
 

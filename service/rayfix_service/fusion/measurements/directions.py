@@ -1,6 +1,7 @@
 """Angles as measured, turned into directions of the scene."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,24 @@ from rayfix_service.fusion.measurements.report import Angle
 from rayfix_tables.geometry.angles import angles_of, direction, local_to_scene
 from rayfix_tables.geometry.mounting import board_to_scene
 from rayfix_tables.site import NO_BIAS, Station
+
+
+class MeasuredAngles(NamedTuple):
+    """Angles as an array in a tilted frame measured them.
+
+    Attributes
+    ----------
+    azimuth : float, rad
+    zenith : float or None, rad
+    cov : ndarray of shape (2, 2), rad2
+    to_scene : ndarray of shape (3, 3)
+        Takes the frame's vectors into the scene's.
+    """
+
+    azimuth: float
+    zenith: float | None
+    cov: NDArray[np.float64]
+    to_scene: NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,14 +40,16 @@ class Direction:
         None when not measured.
     cov : ndarray of shape (2, 2), rad2
         Covariance of azimuth and zenith; infinite on the diagonal for what was not measured.
-    tilt : ndarray of shape (3, 3), optional
-        Of an azimuth alone in a frame whose z axis is not the scene's: takes that frame's vectors into the scene's.
+    local : MeasuredAngles, optional
+        Of angles in a frame whose z axis is not the scene's, where their errors are what the report says: what the
+        fields above say is their first-order approximation, and the azimuth, where it was measured alone, that of the
+        frame.
     """
 
     azimuth: float | None
     zenith: float | None
     cov: NDArray[np.float64]
-    tilt: NDArray[np.float64] | None = None
+    local: MeasuredAngles | None = None
 
 
 NO_DIRECTION = Direction(azimuth=None, zenith=None, cov=np.diag([np.inf, np.inf]))
@@ -78,8 +99,8 @@ def to_scene(angle: Angle, station: Station, north: float) -> Direction:
         bearing, *tilts = station.orientation
         cov = np.diag([azimuth_variance, np.inf])
         if angle.frame == "lcs" and any(tilts):
-            tilt = local_to_scene(station.orientation)
-            return Direction(azimuth=angle.azimuth, zenith=None, cov=cov, tilt=tilt)
+            local = MeasuredAngles(angle.azimuth, None, cov, local_to_scene(station.orientation))
+            return Direction(azimuth=angle.azimuth, zenith=None, cov=cov, local=local)
         turn = {"scene": 0.0, "north": north, "lcs": bearing}[angle.frame]
         return Direction(azimuth=angle.azimuth + turn, zenith=None, cov=cov)
     covariance = angle.correlation * angle.azimuth_stdev * angle.zenith_stdev
@@ -93,7 +114,8 @@ def to_scene(angle: Angle, station: Station, north: float) -> Direction:
     turned = _basis(azimuth, zenith).T @ rotation @ _basis(angle.azimuth, angle.zenith)
     local_sine, sine = np.sin(angle.zenith), max(np.sin(zenith), 1e-9)
     jacobian = np.diag([1.0 / sine, 1.0]) @ turned @ np.diag([local_sine, 1.0])
-    return Direction(azimuth=azimuth, zenith=zenith, cov=jacobian @ cov @ jacobian.T)
+    local = MeasuredAngles(angle.azimuth, angle.zenith, cov, rotation)
+    return Direction(azimuth=azimuth, zenith=zenith, cov=jacobian @ cov @ jacobian.T, local=local)
 
 
 def in_field_of_view(station: Station, measured: Direction) -> bool:

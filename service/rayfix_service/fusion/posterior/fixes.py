@@ -8,7 +8,7 @@ from rayfix_service.fusion.measurements.observations import Observation
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.credible import CredibleRegions
 from rayfix_service.fusion.posterior.fix import Candidate, Fix, Outcome, Status
-from rayfix_service.fusion.posterior.summary import sum_up
+from rayfix_service.fusion.posterior.summary import ReportPosterior
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.outliers import outlier_index
 from rayfix_service.fusion.product.prior import Prior
@@ -21,7 +21,7 @@ _LEAST_CANDIDATE = 1e-3
 
 
 class Product(NamedTuple):
-    """Hypotheses of a report, None where nothing could be used, and what they were made of.
+    """Posterior of a report, None where nothing could be used, and what it was made of.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class Product(NamedTuple):
     unused : dict of int to str
         Why measurements do not, by their indices in the report.
     prior : Prior
-    hypotheses : Hypotheses or None
+    posterior : ReportPosterior or None
     simplified : tuple of str
         What was worked out more coarsely than the report says, since the work per report is bounded or because
         rounding made covariances singular.
@@ -39,12 +39,17 @@ class Product(NamedTuple):
     observations: list[Observation]
     unused: dict[int, str]
     prior: Prior
-    hypotheses: Hypotheses | None
+    posterior: ReportPosterior | None
     simplified: tuple[str, ...] = ()
+
+    @property
+    def hypotheses(self) -> Hypotheses | None:
+        """The posterior as Gaussians."""
+        return None if self.posterior is None else self.posterior.hypotheses()
 
 
 def make_fix(report: Report, product: Product, table: Table, settings: FusionSettings, stop: Stop = NEVER) -> Fix:
-    """Summarise the hypotheses of a report.
+    """Summarise the posterior of a report.
 
     Parameters
     ----------
@@ -52,7 +57,7 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
     product : Product
         Of the report.
     table : Table
-        Of the same site; its free space is what the hypotheses are cut to. They are in its frame, the fix in the
+        Of the same site; its free space is what the posterior is cut to. The posterior is in its frame, the fix in the
         scene's.
     settings : FusionSettings
     stop : Stop
@@ -67,14 +72,13 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
     regions = None
     log_evidence, outlier = 0.0, dict[int, float]()
     status: Status = "insufficient"
-    hypotheses = product.hypotheses
-    if hypotheses is not None:
+    posterior = product.posterior
+    if posterior is not None:
         found = outlier_index(product.observations)
-        summary = None
-        if len(hypotheses):
-            summary = sum_up(hypotheses, found, table.scene.free_space_in_table_frame, settings.hypothesis_floor, stop)
+        space = table.scene.free_space_in_table_frame
+        summary = posterior.summary(found, space, settings.hypothesis_floor, stop)
         if summary is None or not len(summary.probability):
-            log_evidence, status = hypotheses.log_all_outlier, "inconsistent"
+            log_evidence, status = posterior.log_all_outlier, "inconsistent"
             outlier = dict.fromkeys(found.places, 1.0)
         else:
             log_evidence, share = summary.log_evidence, 1.0 - summary.lost

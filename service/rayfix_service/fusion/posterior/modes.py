@@ -16,7 +16,7 @@ from rayfix_tables.gaussians.cholesky import cholesky, invert, solve
 _SAME_MODE = 9.0
 """Two maxima nearer than this, squared and in what either is uncertain by, count as one mode."""
 
-_VALLEY = float(np.log(2.0))
+VALLEY = float(np.log(2.0))
 """Two maxima are of one mode unless the density between them falls to less than half of the lower one, nats.
 
 Two equal Gaussians are two modes from 3.3 of their standard deviations on, nearer ones have too little between them.
@@ -91,7 +91,7 @@ def _modes(gaussians: Any, which: Any, total: Any, origin: Any, voxel_size: Any,
     """Find the modes of Gaussians that are ``which`` of a ``total``; those left out count as the first mode's."""
     log_density, weight, mean, cov, precision = gaussians
     count = len(weight)
-    top, member = gather(log_density, mean, precision, _SAME_MODE, _VALLEY, _FARTHEST, stop)
+    top, member = gather(log_density, mean, precision, _SAME_MODE, VALLEY, _FARTHEST, stop)
     probability, position = np.zeros(len(top)), np.zeros((len(top), 3))
     for h in range(count):
         probability[member[h]] += weight[h]

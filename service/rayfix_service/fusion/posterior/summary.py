@@ -1,7 +1,8 @@
 """Summarise the hypotheses of a report, in one compiled kernel: there are few of them, but many steps for each."""
 
 import math
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import numba
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.posterior.cut_by_walls import cut_to_free_space
 from rayfix_service.fusion.posterior.modes import find_modes
-from rayfix_service.fusion.posterior.points import DrawnPoints, draw_points
+from rayfix_service.fusion.posterior.points import DrawnPoints, Points, draw_points
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.outliers import OutlierIndex, outlier_probabilities
 from rayfix_service.fusion.stopping import NEVER, Stop
@@ -39,7 +40,7 @@ class Summary(NamedTuple):
         Posterior probability of each measurement of the index to be an outlier.
     half_bad : float
         Posterior probability that at least half of the observations are outliers altogether.
-    points : DrawnPoints
+    points : Points
     """
 
     log_evidence: float
@@ -49,7 +50,52 @@ class Summary(NamedTuple):
     moment: NDArray[np.float64]
     outlier: NDArray[np.float64]
     half_bad: float
-    points: DrawnPoints
+    points: Points
+
+
+class ReportPosterior(Protocol):
+    """The posterior of a report's position, whatever it is made of."""
+
+    @property
+    def log_all_outlier(self) -> float:
+        """Log evidence of the case that all measurements are outliers."""
+
+    def summary(self, index: OutlierIndex, free_space: FreeSpace, floor: float, stop: Stop = NEVER) -> Summary | None:
+        """Sum it up, cut to the free space; None where nothing but outliers is left.
+
+        Parameters
+        ----------
+        floor : float
+            Hypotheses whose posterior probability is below this are left out of the modes.
+
+        Raises
+        ------
+        FixStoppedError
+            When ``stop`` was set.
+        """
+
+    def hypotheses(self) -> Hypotheses:
+        """Return it as Gaussians, not yet cut to the free space."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GaussianPosterior:
+    """The posterior as a sum of Gaussians."""
+
+    gaussians: Hypotheses
+
+    @property
+    def log_all_outlier(self) -> float:
+        """Log evidence of the case that all measurements are outliers."""
+        return self.gaussians.log_all_outlier
+
+    def summary(self, index: OutlierIndex, free_space: FreeSpace, floor: float, stop: Stop = NEVER) -> Summary | None:
+        """Sum it up, cut to the free space; None where nothing but outliers is left."""
+        return sum_up(self.gaussians, index, free_space, floor, stop) if len(self.gaussians) else None
+
+    def hypotheses(self) -> Hypotheses:
+        """Return it as Gaussians, not yet cut to the free space."""
+        return self.gaussians
 
 
 def sum_up(

@@ -97,15 +97,8 @@ def make_factor(
         bounds.append(bounds[-1] + len(mixtures[-1]))
     if bounds[-1] == 0:
         return None
-    # Noise counts, so that a measurement with very much of it does not look like an outlier.
-    log_any_time = 0.0
-    for variance in _variances(observation):
-        log_any_time -= math.log(max_path_length + math.sqrt(2.0 * math.pi * variance))
-    log_good, log_bad = math.log1p(-settings.outlier_probability), math.log(settings.outlier_probability)
-    may_be_late = observation.angle_index is not None and bool(observation.lengths or observation.readings)
-    kinds, readings = _good_kinds(observation, log_good if may_be_late else 0.0, max_path_length)
-    if may_be_late:
-        kinds.append(_Kind(TIME_OUTLIER, log_bad + log_any_time, *_ANY_LENGTH[1:]))
+    kinds, readings, log_outlier = kinds_of(observation, settings.outlier_probability, max_path_length)
+    log_good = math.log1p(-settings.outlier_probability)
     parts = [
         (kind.outlier, bounds[n], bounds[n + 1], log_good + spread.log_weight + kind.log_weight, *kind[2:])
         for kind in kinds
@@ -126,7 +119,7 @@ def make_factor(
         tuple(prior),
         tuple(
             AlternativeLimits(
-                log_outlier=log_bad + log_any_time - _log_angle_range(observation),
+                log_outlier=log_outlier,
                 log_floor=math.log(settings.component_floor),
                 max_divergence=float(settings.max_divergence),
                 most=most,
@@ -164,7 +157,7 @@ def _within(parts: list[_Part], size: int, most: int) -> tuple[list[_Part], int]
     return [part for n, part in enumerate(parts) if n not in out], size
 
 
-class _Kind(NamedTuple):
+class Kind(NamedTuple):
     """Alternatives of one kind, as :data:`PART` has them, for Gaussians of any spread."""
 
     outlier: int
@@ -176,9 +169,29 @@ class _Kind(NamedTuple):
     last_reading: int = 0
 
 
+def kinds_of(
+    observation: Observation, outlier_probability: float, max_path_length: float
+) -> tuple[list[Kind], list[tuple[int, float, float]], float]:
+    """Alternatives of an observation but for the one that all of it is an outlier.
+
+    Also gives the readings of clocks that these take in, as :data:`READING` has them, and the log density of the
+    outlier.
+    """
+    # Noise counts, so that a measurement with very much of it does not look like an outlier.
+    log_any_time = 0.0
+    for variance in _time_variances(observation):
+        log_any_time -= math.log(max_path_length + math.sqrt(2.0 * math.pi * variance))
+    log_good, log_bad = math.log1p(-outlier_probability), math.log(outlier_probability)
+    may_be_late = observation.angle_index is not None and bool(observation.lengths or observation.readings)
+    kinds, readings = _good_kinds(observation, log_good if may_be_late else 0.0, max_path_length)
+    if may_be_late:
+        kinds.append(Kind(TIME_OUTLIER, log_bad + log_any_time, *_ANY_LENGTH[1:]))
+    return kinds, readings, log_bad + log_any_time - _log_angle_range(observation)
+
+
 def _good_kinds(
     observation: Observation, log_times_good: float, max_path_length: float
-) -> tuple[list[_Kind], list[tuple[int, float, float]]]:
+) -> tuple[list[Kind], list[tuple[int, float, float]]]:
     """Alternatives for which all times are what they seem, of each combination of the Gaussians of their errors.
 
     Also gives the readings of clocks that these take in, as :data:`READING` has them.
@@ -192,7 +205,7 @@ def _good_kinds(
         readings += joint
         for length in _joint_lengths(observation):
             log_weight = log_times_good + log_readings + length.log_weight
-            kinds.append(_Kind(ALL_GOOD, log_weight, length.value, length.variance, log_clocks, first, last))
+            kinds.append(Kind(ALL_GOOD, log_weight, length.value, length.variance, log_clocks, first, last))
     return kinds, readings
 
 
@@ -216,7 +229,7 @@ def _joint_readings(readings: tuple[ClockReading, ...]) -> list[tuple[float, lis
     ]
 
 
-def _variances(observation: Observation) -> list[float]:
+def _time_variances(observation: Observation) -> list[float]:
     """Variance of each time of an observation, m2, whichever Gaussian it is of."""
     lengths = [total_variance(terms) + observation.length_bias_variance for terms in observation.lengths]
     readings = [

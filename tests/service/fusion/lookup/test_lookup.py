@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.lookup.lookup import SUM_RATIO, Lookup, look_up
-from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
+from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction, MeasuredAngles
 from rayfix_tables.geometry.angles import angles_of, local_to_scene, wrap
 from rayfix_tables.geometry.angles import direction as direction_of
 from rayfix_tables.grid import AngularGrid
@@ -247,7 +247,9 @@ def test_an_azimuth_alone_in_a_tilted_frame(
     seen_azimuth, seen_zenith = angles_of(direction_of(around, up) @ rotation)
     apart = wrap(azimuth - seen_azimuth)
     expected = np.exp(-0.5 * (apart / stdev) ** 2) / (np.sqrt(2.0 * np.pi) * stdev)
-    lookup = look_up(LEVELS, Direction(azimuth=azimuth, zenith=None, cov=np.diag([stdev**2, np.inf]), tilt=rotation))
+    cov = np.diag([stdev**2, np.inf])
+    local = MeasuredAngles(azimuth, None, cov, rotation)
+    lookup = look_up(LEVELS, Direction(azimuth=azimuth, zenith=None, cov=cov, local=local))
     found = represented(lookup, around, up)
     # Far from the tilted frame's poles, where azimuths crowd.
     there = np.abs(seen_zenith - 0.5 * np.pi) < np.deg2rad(50.0)

@@ -174,13 +174,16 @@ def test_an_azimuth_alone_has_a_frame_too() -> None:
     found = turned(30.0, None, frame="lcs", orientation_deg=(45.0, 0.0, 0.0))
     assert found.azimuth == pytest.approx(np.deg2rad(75.0))
     assert found.zenith is None
-    assert found.tilt is None
+    assert found.local is None
     np.testing.assert_allclose(found.cov, np.diag([np.deg2rad(1.0) ** 2, np.inf]), rtol=1e-12)
     tilted = turned(30.0, None, frame="lcs", orientation_deg=(45.0, 20.0, 0.0))
     assert tilted.azimuth == pytest.approx(np.deg2rad(30.0))
     bearing, downtilt = np.deg2rad([45.0, 20.0])
-    np.testing.assert_allclose(tilted.tilt, local_to_scene((float(bearing), float(downtilt), 0.0)), rtol=0, atol=1e-12)
-    assert turned(30.0, None, frame="scene", orientation_deg=(45.0, 20.0, 0.0)).tilt is None
+    assert tilted.local is not None
+    np.testing.assert_allclose(
+        tilted.local.to_scene, local_to_scene((float(bearing), float(downtilt), 0.0)), rtol=0, atol=1e-12
+    )
+    assert turned(30.0, None, frame="scene", orientation_deg=(45.0, 20.0, 0.0)).local is None
 
 
 def test_the_field_of_view_is_a_cone_around_the_stations_axis() -> None:

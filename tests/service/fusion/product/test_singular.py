@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.measurements.observations import sort_report
 from rayfix_service.fusion.posterior.fixes import Product, make_fix
-from rayfix_service.fusion.posterior.summary import sum_up
+from rayfix_service.fusion.posterior.summary import GaussianPosterior, sum_up
 from rayfix_service.fusion.product import beam_kernels, information_form
 from rayfix_service.fusion.product.beam import Hypotheses, multiply
 from rayfix_service.fusion.product.factor_kernels import ALL_GOOD, ALL_OUTLIER, PART, READING, make_alternatives
@@ -128,7 +128,8 @@ def test_a_fix_where_all_are_singular_is_inconsistent(make_table: MakeTable, kin
     tube = line_of_sight("a")
     table, report = make_table(tube), report_of([angle_of(tube)])
     observations = list(sort_report(report, table.site).observations)
-    product = Product(observations, {}, Prior(log_volume=float(np.log(64.0**3))), broken_hypotheses(kind))
+    posterior = GaussianPosterior(gaussians=broken_hypotheses(kind))
+    product = Product(observations, {}, Prior(log_volume=float(np.log(64.0**3))), posterior)
     fix = make_fix(report, product, table, FusionSettings())
     assert (fix.status, fix.candidates, fix.regions, fix.log_evidence) == ("inconsistent", (), None, -4.0)
     assert [outcome.outlier_probability for outcome in fix.outcomes] == [1.0]

@@ -1,0 +1,181 @@
+"""Locate reports whose errors are wide on the path map."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rayfix_service.fusion.measurements.likelihood import log_normal_terms, spreads
+from rayfix_service.fusion.measurements.observations import Observation, SortedReport
+from rayfix_service.fusion.measurements.report import Angle, LogRange, Range, Report
+from rayfix_service.fusion.posterior.summary import Summary
+from rayfix_service.fusion.product.beam import Hypotheses
+from rayfix_service.fusion.product.factor_kernels import ALL_GOOD, ALL_OUTLIER
+from rayfix_service.fusion.product.outliers import OutlierIndex
+from rayfix_service.fusion.product.prior import Prior
+from rayfix_service.fusion.quadrature.blocks import BlockTree, StationPaths
+from rayfix_service.fusion.quadrature.grid import GridLimits, Leaves, integrate
+from rayfix_service.fusion.quadrature.observed import path_factor
+from rayfix_service.fusion.quadrature.summary import sum_up_leaves
+from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.fusion.stopping import NEVER, Stop
+from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.table import Table
+
+_FINEST_LENGTH = 0.05
+"""Reports with a path length that is more accurate, m, are left to Gaussians: its shells are thin."""
+
+_WIDER_THAN = 1.28
+"""Angles are wide from this many deviations of the finest window on; a sum of its cells answers narrower ones."""
+
+
+_LEAST_SECONDS = 1e-3
+"""What any fix takes, s."""
+
+_FACTOR_SECONDS = 6e-4
+"""What each measurement takes, s."""
+
+_POSITION = 3
+"""Coordinates of a position: more measured numbers than that leave nothing open."""
+
+_OPEN = 6.0
+"""By how many times a fix takes longer where something is left open."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GridPosterior:
+    """Posterior of a report on blocks of the free space.
+
+    Attributes
+    ----------
+    leaves : Leaves
+    log_all_outlier : float
+        Log evidence of the case that all measurements are outliers, which the blocks' masses include.
+    omitted : bool
+        Whether blocks are larger than they should be, since there would be too many.
+    """
+
+    leaves: Leaves
+    log_all_outlier: float
+    omitted: bool
+
+    def summary(self, index: OutlierIndex, free_space: FreeSpace, floor: float, stop: Stop = NEVER) -> Summary | None:
+        """Sum the posterior up; ``floor`` is for posteriors of Gaussians."""
+        del floor
+        return sum_up_leaves(self.leaves, self.log_all_outlier, index, free_space, stop)
+
+    def hypotheses(self) -> Hypotheses:
+        """Return a Gaussian for each block, the best first, about as wide as its block."""
+        leaves = self.leaves
+        lost = leaves.lost.prod(axis=1)
+        good = np.flatnonzero(lost < 1.0 - 1e-12)
+        order = good[np.argsort(-leaves.log_mass[good], kind="stable")]
+        half = 0.5 * np.stack([leaves.width[order], leaves.width[order], leaves.height[order]], axis=1)
+        outlier = np.where(leaves.lost[order] > 0.5, ALL_OUTLIER, ALL_GOOD)
+        return Hypotheses(
+            log_weight=leaves.log_mass[order] + np.log1p(-lost[order]),
+            mean=leaves.point[order],
+            cov=half[:, :, None] ** 2 * np.eye(3),
+            outlier=outlier.astype(np.int8),
+            log_all_outlier=self.log_all_outlier,
+        )
+
+
+class Quadrature:
+    """Integrates the posterior of reports, with what follows from a table and is worked out once.
+
+    Parameters
+    ----------
+    table : Table
+    settings : FusionSettings
+    """
+
+    def __init__(self, table: Table, settings: FusionSettings) -> None:
+        self._table, self._settings = table, settings
+        self._limits = GridLimits()
+        self._tree: BlockTree | None = None
+        self._stations: dict[str, StationPaths] = {}
+
+    def suits(self, report: SortedReport) -> bool:
+        """Whether a report is to be located here: all of its errors are wide, and no clock is unknown."""
+        observations = report.observations
+        return bool(observations) and report.num_clocks == 0 and all(map(self._is_wide, observations))
+
+    def _is_wide(self, observation: Observation) -> bool:
+        part = self._table.parts[observation.station_id]
+        if part.paths is None or not len(part.paths):
+            return False
+        if any(term.variance < _FINEST_LENGTH**2 for terms in observation.lengths for term in terms):
+            return False
+        return _narrowest(observation) > _WIDER_THAN * part.levels[0].window
+
+    def seconds(self, report: Report) -> float | None:
+        """Estimate how long a fix will take here, s; None for a report that Gaussians answer.
+
+        A report that leaves the position open along a line or a surface takes long, as does one of many combinations of
+        errors.
+        """
+        known, combinations = 0 if report.height is None else 1, 1
+        for m in report.measurements:
+            part = self._table.parts.get(m.station_id)
+            if part is None or part.paths is None or not isinstance(m, Angle | Range | LogRange):
+                return None
+            if isinstance(m, Angle):
+                stdevs = [m.azimuth_stdev] if m.zenith_stdev is None else [m.azimuth_stdev, m.zenith_stdev]
+                if min(stdevs) <= _WIDER_THAN * part.levels[0].window:
+                    return None
+                known += len(stdevs)
+                combinations += len(spreads(m.error_model)) - 1
+            else:
+                known += 1
+                combinations += _num_terms(m) - 1
+        slow = 1.0 if known > _POSITION else _OPEN
+        return _LEAST_SECONDS + _FACTOR_SECONDS * len(report.measurements) * combinations * slow
+
+    def posterior(self, observations: Sequence[Observation], prior: Prior, stop: Stop = NEVER) -> GridPosterior:
+        """Integrate the posterior of observations.
+
+        Raises
+        ------
+        FixStoppedError
+            When it was stopped.
+        """
+        factors = [path_factor(each, self._settings, self._table.site.max_path_length) for each in observations]
+        stations = [self._station(each.station_id) for each in observations]
+        leaves, omitted = integrate(self.tree, stations, factors, prior, self._limits, stop)
+        log_all_outlier = sum(float(np.log(factor.outlier)) for factor in factors)
+        return GridPosterior(leaves=leaves, log_all_outlier=log_all_outlier, omitted=omitted)
+
+    @property
+    def tree(self) -> BlockTree:
+        """Blocks of the table's free space."""
+        if self._tree is None:
+            space = self._table.scene.free_space_in_table_frame
+            paths = next(part.paths for part in self._table.parts.values() if part.paths is not None)
+            self._tree = BlockTree(space, max(1, round(paths.voxel_size / space.voxel_size)))
+        return self._tree
+
+    def _station(self, name: str) -> StationPaths:
+        found = self._stations.get(name)
+        if found is None:
+            paths = self._table.parts[name].paths
+            assert paths is not None
+            found = self._stations[name] = StationPaths(paths, self.tree)
+        return found
+
+
+def _num_terms(length: Range | LogRange) -> int:
+    """Count the Gaussians that the error of a length may be of."""
+    if isinstance(length, LogRange):
+        return len(log_normal_terms(length.path_length, length.log_stdev))
+    return len(spreads(length.error_model))
+
+
+def _narrowest(observation: Observation) -> float:
+    """Smallest standard deviation of an observation's angles, rad, infinite where there is none."""
+    cov = observation.direction.cov if observation.direction.local is None else observation.direction.local.cov
+    if not np.isfinite(cov[0, 0]):
+        return np.inf
+    if not np.isfinite(cov[1, 1]):
+        return float(np.sqrt(cov[0, 0]))
+    return float(np.sqrt(np.linalg.eigvalsh(cov)[0]))

@@ -1,0 +1,260 @@
+"""Integrate the posterior over the free space by blocks, which are halved where it is large and not yet resolved."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.product.prior import Prior
+from rayfix_service.fusion.quadrature.blocks import BlockPaths, BlockTree, StationPaths
+from rayfix_service.fusion.quadrature.factor import PathFactor, evaluate, expected_directions
+from rayfix_service.fusion.quadrature.layers import Layers, layers_of
+from rayfix_service.fusion.stopping import NEVER, Stop
+
+_OCTANTS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+
+Array = NDArray[np.float64]
+
+
+class GridLimits(NamedTuple):
+    """How finely the posterior is integrated.
+
+    Attributes
+    ----------
+    least_share : float
+        Blocks that hold a smaller fraction of the posterior are not halved.
+    resolution : float
+        A block is small enough when the variance of a position in it times the information there is below this.
+    most_halvings : int
+        Of the path map's voxels.
+    most_leaves : int
+        Halving ends when there would be more blocks than this.
+    """
+
+    least_share: float = 5e-4
+    resolution: float = 0.12
+    most_halvings: int = 4
+    most_leaves: int = 50_000
+
+
+class Leaves(NamedTuple):
+    """Blocks that the posterior is a sum of.
+
+    Attributes
+    ----------
+    point : ndarray of shape (n, 3), m
+        Where the posterior was evaluated.
+    halvings : ndarray of int64, shape (n,)
+        Of the path map's voxels; negative for larger blocks.
+    cell : ndarray of int64, shape (n, 3)
+        Coordinates of the block among those of its size.
+    width, height : ndarray of shape (n,), m
+        Of the block; with a known height, of the layer of it that matters.
+    log_mass : ndarray of shape (n,)
+        Natural logarithm of the integral of prior times likelihood over the block.
+    log_volume : ndarray of shape (n,), m3
+        Of the block's free part.
+    late, lost : ndarray of shape (n, n_factors)
+        Probability that a factor's times are outliers and its angle is not, and that all of it is.
+    """
+
+    point: Array
+    halvings: NDArray[np.int64]
+    cell: NDArray[np.int64]
+    width: Array
+    height: Array
+    log_mass: Array
+    log_volume: Array
+    late: Array
+    lost: Array
+
+
+class _Front(NamedTuple):
+    """Blocks of one size that are to be evaluated; ``block`` is that of the paths to them."""
+
+    cell: NDArray[np.int64]
+    block: NDArray[np.int64]
+    point: Array
+    volume: Array
+
+
+def integrate(
+    tree: BlockTree,
+    stations: Sequence[StationPaths],
+    factors: Sequence[PathFactor],
+    prior: Prior,
+    limits: GridLimits,
+    stop: Stop = NEVER,
+) -> tuple[Leaves, bool]:
+    """Integrate the posterior of factors.
+
+    Parameters
+    ----------
+    tree : BlockTree
+    stations : sequence of StationPaths
+        Of each factor in turn.
+    factors : sequence of PathFactor
+    prior : Prior
+        In the frame of the tree.
+    limits : GridLimits
+    stop : Stop
+        Ends it early.
+
+    Returns
+    -------
+    leaves : Leaves
+    omitted : bool
+        Whether blocks are larger than they should be, since there would be too many.
+
+    Raises
+    ------
+    FixStoppedError
+        When it was stopped.
+    """
+    geometries = [
+        (each.images, each.mirrors, each.num_reflections, expected_directions(each.mirrors, _measured(factor)))
+        for each, factor in zip(stations, factors, strict=True)
+    ]
+    # Several stations tell of a direction together; half of them, since each tells of two out of three.
+    resolution = limits.resolution / max(1.0, 0.5 * len(factors))
+    halvings = 1 - len(tree.levels)
+    front = _largest(tree)
+    done: list[Leaves] = []
+    log_done, num_done = -math.inf, 0
+    while True:
+        stop.check()
+        width = tree.levels[0].size * 0.5**halvings
+        front, layers = _in_layers(front, prior, tree, width)
+        count = len(front.block)
+
+        def at(points: Array, front: _Front = front, width: float = width, halvings: int = halvings) -> _Evaluated:
+            levels = [station.levels[max(-halvings, 0)] for station in stations]
+            return _evaluated(points, front.block, width**2 / 12.0, resolution, levels, geometries, factors)
+
+        log_volume = np.log(front.volume)
+        if layers.keep is None:
+            point, height, found = front.point, layers.height, at(front.point)
+        else:
+            point, height, found = _at_two_heights(front.point, layers.height, at)
+        log_mass = log_volume + layers.log_density + found.log_likelihood
+        information, late, lost = found.information, found.late, found.lost
+        log_all = np.logaddexp(log_done, np.logaddexp.reduce(log_mass, initial=-math.inf))
+        halve = (log_mass - log_all > math.log(limits.least_share)) & (
+            width**2 / 12.0 * information > limits.resolution
+        )
+        ends = halvings >= limits.most_halvings or num_done + count + 8 * np.count_nonzero(halve) > limits.most_leaves
+        keep = np.ones(count, np.bool_) if ends else ~halve
+        kept = int(np.count_nonzero(keep))
+        done.append(
+            Leaves(
+                point=point[keep],
+                halvings=np.full(kept, halvings),
+                cell=front.cell[keep],
+                width=np.full(kept, width),
+                height=height[keep],
+                log_mass=log_mass[keep],
+                log_volume=log_volume[keep],
+                late=late[:, keep].T,
+                lost=lost[:, keep].T,
+            )
+        )
+        if kept == count:
+            return Leaves(*map(np.concatenate, zip(*done, strict=True))), bool(halve.any())
+        num_done += kept
+        log_done = np.logaddexp(log_done, np.logaddexp.reduce(log_mass[keep], initial=-math.inf))
+        front = _halved(tree, front, halve, halvings)
+        halvings += 1
+
+
+class _Evaluated(NamedTuple):
+    """The likelihood at some points; the last two have the shape (n_factors, n)."""
+
+    log_likelihood: Array
+    information: Array
+    late: Array
+    lost: Array
+
+
+def _evaluated(
+    points: Array,
+    blocks: NDArray[np.int64],
+    spread: float,
+    resolution: float,
+    levels: Sequence[BlockPaths],
+    geometries: Sequence[tuple[NDArray[Any], ...]],
+    factors: Sequence[PathFactor],
+) -> _Evaluated:
+    """Evaluate all factors at points."""
+    count = len(points)
+    found = _Evaluated(np.zeros(count), np.zeros(count), *np.empty((2, len(factors), count)))
+    density, told = np.empty(count), np.empty(count)
+    for n, (paths, geometry, factor) in enumerate(zip(levels, geometries, factors, strict=True)):
+        out = density, found.late[n], found.lost[n], told
+        evaluate(points, blocks, spread, resolution, tuple(paths), geometry, tuple(factor), out)
+        np.add(found.log_likelihood, np.log(density), out=found.log_likelihood)
+        np.add(found.information, told, out=found.information)
+    return found
+
+
+def _at_two_heights(point: Array, height: Array, at: Callable[[Array], _Evaluated]) -> tuple[Array, Array, _Evaluated]:
+    """Integrate over the heights of thin layers, by the rule of Gauss with two nodes: the mean and one deviation off.
+
+    Returns
+    -------
+    point : ndarray of shape (n, 3), m
+        At the posterior's mean height in the layer.
+    height : ndarray of shape (n,), m
+        Of a layer in which a uniform height varies as much as the posterior's.
+    found : _Evaluated
+        Means over the heights.
+    """
+    step = np.zeros_like(point)
+    step[:, 2] = height / math.sqrt(12.0)
+    low, high = at(point - step), at(point + step)
+    lean = np.tanh(0.5 * (high.log_likelihood - low.log_likelihood))
+    of_low, of_high = 0.5 * (1.0 - lean), 0.5 * (1.0 + lean)
+    found = _Evaluated(
+        np.logaddexp(low.log_likelihood, high.log_likelihood) - math.log(2.0),
+        *(of_low * below + of_high * above for below, above in zip(low[1:], high[1:], strict=True)),
+    )
+    return point + lean[:, None] * step, height * np.sqrt(np.maximum(1.0 - lean**2, 1e-4)), found
+
+
+def _measured(factor: PathFactor) -> Array:
+    """Measured direction in the scene; NaN where there is none."""
+    return np.asarray(factor.turn.T @ np.array([math.sin(factor.zenith), 0.0, math.cos(factor.zenith)]))
+
+
+def _largest(tree: BlockTree) -> _Front:
+    blocks, top = tree.levels[-1], tree.top
+    cell = np.stack(np.unravel_index(top, blocks.shape), axis=1)
+    return _Front(cell, top, blocks.centre[top], blocks.volume[top])
+
+
+def _halved(tree: BlockTree, front: _Front, which: NDArray[np.bool_], halvings: int) -> _Front:
+    """Eight halves of each block, those without free space left out."""
+    cell = (2 * front.cell[which][:, None, :] + _OCTANTS).reshape(-1, 3)
+    if halvings < 0:
+        blocks = tree.levels[-halvings - 1]
+        cell = cell[np.all(cell < blocks.shape, axis=1)]
+        block = (cell[:, 0] * blocks.shape[1] + cell[:, 1]) * blocks.shape[2] + cell[:, 2]
+        free = blocks.volume[block] > 0.0
+        block = block[free]
+        return _Front(cell[free], block, blocks.centre[block], blocks.volume[block])
+    width = tree.levels[0].size * 0.5 ** (halvings + 1)
+    point = tree.free_space.origin + width * (cell + 0.5)
+    free = tree.free_space.contains(point)
+    block = np.repeat(front.block[which], 8)[free]
+    return _Front(cell[free], block, point[free], np.full(len(block), width**3))
+
+
+def _in_layers(front: _Front, prior: Prior, tree: BlockTree, width: float) -> tuple[_Front, Layers]:
+    """Move the points of blocks to where the prior is in their layer, and leave out layers where it is not."""
+    layers = layers_of(prior, front.cell[:, 2], float(tree.free_space.origin[2]), width)
+    if layers.keep is None:
+        return front, layers
+    point = front.point[layers.keep]
+    point[:, 2] = layers.middle
+    return _Front(front.cell[layers.keep], front.block[layers.keep], point, front.volume[layers.keep]), layers

@@ -1,0 +1,60 @@
+"""Turn an observation into what the kernel evaluates at positions."""
+
+import math
+
+import numpy as np
+
+from rayfix_service.fusion.measurements.directions import Direction, MeasuredAngles
+from rayfix_service.fusion.measurements.line_of_sight import LineOfSightWeights, line_of_sight_weights
+from rayfix_service.fusion.measurements.observations import Observation
+from rayfix_service.fusion.product.factors import kinds_of
+from rayfix_service.fusion.quadrature.factor import PathFactor
+from rayfix_service.fusion.settings import FusionSettings
+
+_NO_INDICATION = LineOfSightWeights(0.0, 0.0)
+_SCENE = np.eye(3)
+
+
+def path_factor(observation: Observation, settings: FusionSettings, max_path_length: float) -> PathFactor:
+    """Measurements of one path as the kernel takes them; the times must not depend on a clock.
+
+    Parameters
+    ----------
+    max_path_length : float, m
+        A time that is an outlier may be anything up to this, and noise.
+    """
+    kinds, _, log_outlier = kinds_of(observation, settings.outlier_probability, max_path_length)
+    indicated = observation.los_probability
+    weights = _NO_INDICATION if indicated is None else line_of_sight_weights(indicated, settings.sight_error)
+    angles = _angles(observation.direction)
+    azimuth = 0.0 if angles is None else angles.azimuth
+    to_measured = _about_z(-azimuth) @ (_SCENE if angles is None else angles.to_scene.T)
+    zenith = math.nan if angles is None or angles.zenith is None else angles.zenith
+    cov = observation.direction.cov if angles is None else angles.cov
+    log_good = math.log1p(-settings.outlier_probability)
+    return PathFactor(
+        turn=np.ascontiguousarray(to_measured),
+        zenith=zenith,
+        cov=np.array([cov[0, 0], cov[0, 1], cov[1, 1]]),
+        spreads=np.array([[math.exp(log_good + each.log_weight), each.scale] for each in observation.angle_spreads]),
+        kinds=np.array(
+            [[kind.outlier, math.exp(kind.log_weight), kind.length, kind.length_variance] for kind in kinds]
+        ),
+        direct=math.exp(weights.log_direct),
+        reflected=math.exp(weights.log_reflected),
+        outlier=math.exp(log_outlier),
+    )
+
+
+def _angles(direction: Direction) -> MeasuredAngles | None:
+    """Angles as they were measured, None where none was."""
+    if direction.local is not None:
+        return direction.local
+    if direction.azimuth is None:
+        return None
+    return MeasuredAngles(direction.azimuth, direction.zenith, direction.cov, _SCENE)
+
+
+def _about_z(angle: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
