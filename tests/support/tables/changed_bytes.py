@@ -10,6 +10,9 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from rayfix_tables.errors import TableError
 from rayfix_tables.mixture import FIELD_SHAPES
@@ -44,8 +47,9 @@ def outcomes_of_changes(table: Path, copy: Path, places: range) -> list[Outcome]
 
 def content_digest(table: Table) -> str:
     """Return a digest of all that decides an answer."""
-    arrays = [table.scene.vertices, table.scene.faces, table.scene.face_materials, table.scene.free_space.free]
-    words = [repr(table.site), repr(table.scene.materials), repr(table.scene.free_space.origin)]
+    scene = table.scene
+    arrays: list[NDArray[Any]] = [scene.vertices, scene.faces, scene.face_materials, scene.free_space.free]
+    words = [repr(table.site), repr(scene.materials), repr(scene.free_space.origin)]
     for part in table.parts.values():
         words.append(repr((part.station, part.lost_ray_share, part.coverage)))
         for level in part.levels:
