@@ -20,6 +20,7 @@ import uvicorn
 
 from rayfix_service.http.access.keys import read_key_file
 from rayfix_service.http.access.rates import Accounts
+from rayfix_service.http.answering.freed_memory import one_arena
 from rayfix_service.http.answering.runtime_folder import runtime_folder
 from rayfix_service.http.answering.served_tables import ServedTable, follow_changes, load_tables
 from rayfix_service.http.answering.table_checks import TableChecks
@@ -113,6 +114,7 @@ def serve(
     check_address(host, port)
     with ExitStack() as stack:
         stack.enter_context(logging_restored())
+        stack.enter_context(one_arena())
         if workers > 1:
             settings = replace(settings, runtime_folder=stack.enter_context(_runtime_folder()))
         if MULTIPROCESS_VARIABLE in os.environ:
