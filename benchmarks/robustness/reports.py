@@ -5,17 +5,15 @@
 Every position must lie in the free space, be finite, and have a positive definite covariance; the candidates'
 probabilities add up to the confidence that the answer states, and to one at most; no answer is 5xx but 504 for a fix
 that reached its time limit; the most memory in the second half of the run is at most `--growth` MiB above that in the
-first, and no file descriptor is left open. Of the valid reports, `--slow-share` are of all kinds, nine of ten of which
-are slow by their estimate and are located in threads; the others are drawn until the estimate calls them quick. The
-service runs with MALLOC_MMAP_THRESHOLD_=131072, so that what the C library keeps of freed memory is not taken for a
-leak, unless `--usual-memory` is given. Request n depends on the seed and n alone: `--only n` sends that one and prints
-the answer.
+first, and no file descriptor is left open. Memory is looked at when the service has had no request for `--rest`
+seconds, in which it gives back what slow fixes have freed. Of the valid reports, `--slow-share` are of all kinds, nine
+of ten of which are slow by their estimate and are located in threads; the others are drawn until the estimate calls
+them quick. Request n depends on the seed and n alone: `--only n` sends that one and prints the answer.
 """
 
 import http.client
 import json
 import math
-import os
 import sys
 import threading
 import time
@@ -160,13 +158,9 @@ def main() -> None:
     parser.add_argument("--slow-share", type=float, default=0.1, help="of the valid ones; default 0.1")
     parser.add_argument("--seconds", type=float, default=3600.0, help="when to end earlier")
     parser.add_argument("--growth", type=float, default=4.0, help="MiB; default 4")
-    parser.add_argument(
-        "--usual-memory", action="store_true", help="let the C library keep freed memory as it does for users"
-    )
+    parser.add_argument("--rest", type=float, default=3.0, help="s before memory is looked at; default 3")
     parser.add_argument("--only", type=int, metavar="N", help="send one request")
     options = parser.parse_args()
-    if not options.usual_memory:
-        os.environ["MALLOC_MMAP_THRESHOLD_"] = str(128 << 10)
     total = options.valid + options.malformed
     with open_or_build(options.table) as table, running(serve_command(table.path)) as service:
         locator = Locator(table)
@@ -192,6 +186,7 @@ def main() -> None:
                 ]
             for each in sending:
                 each.result()
+            time.sleep(options.rest)
             memory.append(resident_mebibytes(pid))
             done = sum(found.statuses.values())
             print(f"{done:8} requests  {time.monotonic() - begin:6.0f} s  {memory[-1]:7.1f} MiB", flush=True)

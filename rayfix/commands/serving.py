@@ -148,14 +148,12 @@ def _add_message_arguments(command: argparse.ArgumentParser) -> None:
 
 def _serve(options: argparse.Namespace) -> int:
     with needs_extra("service"):
-        from rayfix_service.http.settings import (
-            BodyLimits,
-            ConnectionLimits,
-            FeedLimits,
-            ServiceSettings,
-        )
-        from rayfix_service.server.server import is_loopback, serve
-        from rayfix_service.wire.limits import MessageLimits
+        from rayfix_service.process_wide import collector_paused
+
+        with collector_paused():  # what is imported stays
+            from rayfix_service.http.settings import BodyLimits, ConnectionLimits, FeedLimits, ServiceSettings
+            from rayfix_service.server.server import is_loopback, serve
+            from rayfix_service.wire.limits import MessageLimits
     from rayfix_tables.checked import CheckLimits
 
     serve(

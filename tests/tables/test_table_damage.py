@@ -12,9 +12,9 @@ import pytest
 from rayfix_tables.disk.layout import damage_reported
 from rayfix_tables.disk.schema import LEVEL_DATASETS, SCENE_DATASETS, TEXT_DATASETS, write_text
 from rayfix_tables.errors import CorruptTableError, FormatVersionError, NotATableError, TableError
-from rayfix_tables.mixture import FIELD_SHAPES
 from rayfix_tables.table import Table
 from tests.support.messages.refusals import refusal
+from tests.support.tables.changed_bytes import content_digest, outcomes_of_changes
 from tests.support.tables.table_edits import put_text
 
 REBUILD = "restore it from a copy or build it again"
@@ -284,41 +284,24 @@ def test_a_changed_software_version_is_no_damage(small_table_path: Path) -> None
     assert Table.open(small_table_path).software_version == "9.9"
 
 
-def content_of(table: Table) -> list[bytes]:
-    """Give all that decides an answer."""
-    arrays = [table.scene.vertices, table.scene.faces, table.scene.face_materials, table.scene.free_space.free]
-    words = [repr(table.site), repr(table.scene.materials), repr(table.scene.free_space.origin)]
-    for part in table.parts.values():
-        words.append(repr((part.station, part.lost_ray_share, part.coverage)))
-        for level in part.levels:
-            words.append(repr(level.window))
-            arrays += [level.grid.ring_cells, level.cell_offsets, level.cell_log_mass]
-            arrays += [getattr(level.mixture, name) for name in FIELD_SHAPES]
-    return [*(word.encode() for word in words), *(array.tobytes() for array in arrays)]
-
-
 def test_a_changed_byte_anywhere_is_found_or_has_no_effect(
     small_table_path: Path, make_content: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """HDF5's own administration fails in many ways; each is a damaged table, and none changes an answer unseen."""
+    """HDF5's own administration fails in many ways; each is a damaged table, and none changes an answer unseen.
+
+    Some releases of HDF5 crash on a few of these files.
+    """
     path = tmp_path / "t.h5"
     make_content(1, num_stations=1, num_levels=1).write(small_table_path)
-    expected = content_of(Table.open(small_table_path))
-    raw = small_table_path.read_bytes()
-    places = range(3, len(raw), 101)
-    problems = []
-    for place in places:
-        changed = bytearray(raw)
-        changed[place] ^= 0x55
-        path.write_bytes(changed)
-        try:
-            verified(path)
-        except TableError as error:
-            problems.append(str(error))
-        else:
-            assert content_of(Table.open(path)) == expected
+    expected = content_digest(Table.open(small_table_path))
+    places = range(3, small_table_path.stat().st_size, 101)
+    outcomes = outcomes_of_changes(small_table_path, path, places)
+    problems = [outcome.problem for outcome in outcomes if outcome.problem is not None]
+    digests = [outcome.digest for outcome in outcomes if outcome.digest is not None]
     assert all(str(path) in problem and "\n" not in problem for problem in problems)
+    assert set(digests) <= {expected}
     assert len(problems) > 0.4 * len(places)
+    assert len(places) - len(problems) - len(digests) < 0.01 * len(places)
 
 
 @pytest.mark.slow

@@ -21,6 +21,8 @@ _PREFIX = "+UUDF:"
 _TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d{1,9})?(?:Z|[+-]\d\d:?\d\d)?")
 """Time that a log writes before an event: ISO 8601, UTC unless it has a time zone."""
 
+_INTEGER = re.compile("-?[0-9]{1,20}")
+
 _LONGEST_MS = 24 * 3600 * 1000
 """Lines are at most a day older than the last one of their message; a larger difference is an anchor's restart."""
 
@@ -126,7 +128,7 @@ def parse_uudf(line: str) -> UudfEvent:
         raise _invalid(f"has {len(fields)} fields; give 9, or 10 with the sequence number")
     numbers: dict[int, int] = {}
     for index, name, low, high in _INTEGERS[: len(fields) - 3]:
-        numbers[index] = int(fields[index]) if re.fullmatch("-?[0-9]{1,20}", fields[index]) else low - 1
+        numbers[index] = int(fields[index]) if _INTEGER.fullmatch(fields[index]) else low - 1
         if not low <= numbers[index] <= high:
             raise _invalid(f"has {name} {shown(fields[index])}; give an integer from {low} to {high}")
     for index, name in ((0, "instance id"), (6, "anchor id")):

@@ -12,7 +12,8 @@ from typing import Any
 from fastapi import Depends, FastAPI
 from fastapi.middleware.cors import CORSMiddleware
 from pydantic.json_schema import models_json_schema
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rayfix_service.adapters.nrppa_documents import NrppaBatchDocument, NrppaDocument
 from rayfix_service.adapters.omlox_hub import open_hub
@@ -25,6 +26,7 @@ from rayfix_service.http.access.rates import Accounts, RateLimit
 from rayfix_service.http.answering.broker_state import BrokerState
 from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.feed_relay import FeedRelay
+from rayfix_service.http.answering.freed_memory import FreedMemory
 from rayfix_service.http.answering.locating import Answerer
 from rayfix_service.http.answering.served_tables import ServedTable, Tables
 from rayfix_service.http.answering.slow_work import SlowWork
@@ -161,8 +163,12 @@ def create_app(
         if settings.runtime_folder is not None:
             relay = FeedRelay(feed, settings.runtime_folder)
             keeping.append(asyncio.create_task(relay.keep()))
+        freed = FreedMemory() if settings.own_process else None
         slow_work = SlowWork(
-            threads=settings.slow_fix_threads, waiting=settings.slow_fixes_waiting, seconds=settings.fix_seconds
+            threads=settings.slow_fix_threads,
+            waiting=settings.slow_fixes_waiting,
+            seconds=settings.fix_seconds,
+            on_done=None if freed is None else freed.soon,
         )
         broker = None
         if settings.mqtt is not None:
@@ -183,6 +189,7 @@ def create_app(
                         hub=hub,
                         quick_seconds=settings.quick_fix_seconds,
                         message_limits=settings.message_limits,
+                        freed_memory=freed,
                     )
                     services = Services(
                         settings=settings,
@@ -199,6 +206,7 @@ def create_app(
                     if settings.runtime_folder is not None:
                         forget_dead_workers()
                         await _take_turn(tables, settings.runtime_folder / "ready", stopping)
+                    await _prepare_requests(app)
                     async with _broker_read(services):
                         yield {NOTE: metrics.connection_closed}
         finally:
@@ -207,6 +215,8 @@ def create_app(
                 task.cancel()
             await asyncio.wait(keeping)
             slow_work.close()
+            if freed is not None:
+                freed.close()
 
     app = RayfixApp(
         title="rayfix",
@@ -290,6 +300,24 @@ async def _broker_read(services: Services) -> AsyncIterator[None]:
     finally:
         reading.cancel()
         await asyncio.wait([reading])
+
+
+async def _prepare_requests(app: FastAPI) -> None:
+    """Do what FastAPI and anyio put off until the first request, which would hold the event loop for 30 ms.
+
+    FastAPI prepares the routes of a router when a request is first compared with them, and anyio imports its support of
+    asyncio when it is first asked whether a client has left.
+    """
+
+    async def receive() -> Message:
+        return {"type": "http.disconnect"}
+
+    async def send(_: Message) -> None:
+        pass
+
+    scope = {"type": "http", "method": "GET", "path": "/v1/none", "root_path": "", "query_string": b"", "headers": []}
+    await app.router(scope, receive, send)
+    await Request(scope, receive).is_disconnected()
 
 
 async def _freeze(tables: Tables) -> None:

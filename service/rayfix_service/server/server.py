@@ -20,6 +20,7 @@ import uvicorn
 
 from rayfix_service.http.access.keys import read_key_file
 from rayfix_service.http.access.rates import Accounts
+from rayfix_service.http.answering.freed_memory import one_arena
 from rayfix_service.http.answering.runtime_folder import runtime_folder
 from rayfix_service.http.answering.served_tables import ServedTable, follow_changes, load_tables
 from rayfix_service.http.answering.table_checks import TableChecks
@@ -28,7 +29,7 @@ from rayfix_service.http.settings import ConnectionLimits, ServiceSettings
 from rayfix_service.http.telemetry.connections import Crowd
 from rayfix_service.http.telemetry.logs import LogFormat, log_config
 from rayfix_service.http.telemetry.metrics import MULTIPROCESS_VARIABLE, share_figures
-from rayfix_service.process_wide import logging_restored
+from rayfix_service.process_wide import collector_paused, logging_restored
 from rayfix_service.server.app import create_app
 from rayfix_service.server.protocol import GatheringProtocol, SocketProtocol
 from rayfix_service.server.workers import COULD_NOT_START, run_workers, tell_failure, tell_started
@@ -113,6 +114,7 @@ def serve(
     check_address(host, port)
     with ExitStack() as stack:
         stack.enter_context(logging_restored())
+        stack.enter_context(one_arena())
         if workers > 1:
             settings = replace(settings, runtime_folder=stack.enter_context(_runtime_folder()))
         if MULTIPROCESS_VARIABLE in os.environ:
@@ -137,7 +139,8 @@ def serve(
         )
         if limits != settings.connection_limits:
             _log.warning(_FEW_FILES, limits.connections, settings.connection_limits.connections)
-        at_hand.update(load_tables(path, checks=checks))  # after logging is configured: compiling kernels logs messages
+        with collector_paused():
+            at_hand.update(load_tables(path, checks=checks))  # after logging is configured: compiling logs messages
         if not viewer_is_built():
             _log.warning(_NO_VIEWER)
         if settings.mqtt is not None:
@@ -145,13 +148,13 @@ def serve(
             from rayfix_service.http.answering.mqtt_listener import check_source
 
             check_source(settings.mqtt, at_hand)
+        gc.collect()  # while nobody waits for an answer
+        gc.freeze()  # a collection would write to the workers' shared memory and thus copy it
+        stack.callback(gc.unfreeze)
         if workers == 1:
             with suppress(KeyboardInterrupt):
                 _run(config)
             return
-        gc.collect()
-        gc.freeze()  # a collection would write to the workers' shared memory and thus copy it
-        stack.callback(gc.unfreeze)
         with config.bind_socket() as bound:
             run_workers(
                 partial(_work, config, bound),

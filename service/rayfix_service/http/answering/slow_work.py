@@ -33,13 +33,18 @@ class SlowWork:
         Fixes that may wait for a thread; more are refused.
     seconds : float
         After which a fix is given up, waiting included. Its thread is free again some milliseconds later.
+    on_done : callable, optional
+        Called on the event loop whenever a thread is free again.
     """
 
-    def __init__(self, *, threads: int, waiting: int, seconds: float) -> None:
+    def __init__(
+        self, *, threads: int, waiting: int, seconds: float, on_done: Callable[[], None] | None = None
+    ) -> None:
         self._executor = ThreadPoolExecutor(threads, thread_name_prefix="slow-fix")
         self._most = threads + waiting
         self._seconds = seconds
         self._under_way = 0
+        self._on_done = on_done
 
     @property
     def under_way(self) -> int:
@@ -108,6 +113,8 @@ class SlowWork:
 
     def _done(self) -> None:
         self._under_way -= 1
+        if self._on_done is not None:
+            self._on_done()
 
     def close(self) -> None:
         """End the threads."""

@@ -15,7 +15,7 @@ from rayfix_service.adapters.silabs import SilabsBatchDocument, SilabsDocument, 
 from rayfix_service.adapters.ublox import USUAL_ERRORS, AngleErrors
 from rayfix_service.http.access.guard import charge_reports
 from rayfix_service.http.answering.cooperative import Cooperation
-from rayfix_service.http.answering.locating import Incoming, foreign
+from rayfix_service.http.answering.locating import READ_LINES_AT_ONCE, Incoming, foreign
 from rayfix_service.http.openapi.examples import (
     NRPPA_BATCH_EXAMPLES,
     NRPPA_EXAMPLES,
@@ -167,7 +167,7 @@ async def post_ublox(
         errors=AngleErrors(stdev_deg=stdev_deg, tail_share=tail_share, tail_scale=tail_scale),
         received=datetime.now(UTC),
     )
-    messages = await answerer.read(read, body)
+    messages = await answerer.read(read, body, at_once=READ_LINES_AT_ONCE)
     charge_reports(request, len(messages))
     cooperation = Cooperation(request)
     for adapted in messages:
