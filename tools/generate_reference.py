@@ -61,6 +61,8 @@ SECTIONS = (
     ("TableSection", "[table]", "Windows and fit of the table; the whole section may be left out."),
     ("StationSection", "[[stations]]", "One section for each base station, anchor or locator. [Mounting](mounting.md) draws its angles."),
     ("BiasSection", "bias of a station", "Measured minus true; the fusion takes it off. [Measurements](measurements.md#bias-of-a-station)."),
+    ("AngleBiasSection", "bias that depends on the direction", "Written by `rayfix calibrate`; between the directions of the grid the fusion interpolates. [Calibration](calibration.md)."),
+    ("DeviationsSection", "errors of a station's measurements", "Written by `rayfix calibrate`; the fusion takes them instead of what reports state. [Calibration](calibration.md)."),
 )  # fmt: skip
 
 COMMAND_HEAD = """\

@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from rayfix_tables.errors import SiteError
 from rayfix_tables.geometry.mounting import Boresight, boresight_of, orientation_of
-from rayfix_tables.site import Mounting, SiteInfo, Station, StationBias
+from rayfix_tables.site import AngleBias, Deviations, Mounting, SiteInfo, Station, StationBias
 from rayfix_tables.validation.problems import path_text
 
 MIN_WINDOW_RATIO = 1.5
@@ -137,6 +138,83 @@ class TableSection(_Section):
         return self
 
 
+Grid = tuple[tuple[Annotated[float, Field(ge=-180, le=180)], ...], ...]
+Spreads = tuple[tuple[Annotated[float, Field(ge=0, le=180)], ...], ...]
+
+
+class AngleBiasSection(_Section):
+    """``[stations.bias.angles]``: biases that depend on the direction, as ``rayfix calibrate`` writes them."""
+
+    azimuths_deg: tuple[Annotated[float, Field(ge=-360, le=360)], ...] = Field(
+        min_length=1, max_length=40, description="azimuths of the grid, ascending, in the frame of the reports"
+    )
+    zeniths_deg: tuple[Annotated[float, Field(ge=0, le=180)], ...] = Field(
+        min_length=1, max_length=20, description="zenith angles of the grid, ascending"
+    )
+    azimuth_deg: Grid = Field(description="bias of azimuths at each direction of the grid, a row for each zenith")
+    zenith_deg: Grid = Field(description="bias of zenith angles, likewise")
+    azimuth_stdev_deg: Spreads = Field(description="standard deviation of these biases of azimuths")
+    zenith_stdev_deg: Spreads = Field(description="standard deviation of those of zenith angles")
+
+    @model_validator(mode="after")
+    def _is_grid(self) -> "AngleBiasSection":
+        shape = len(self.zeniths_deg), len(self.azimuths_deg)
+        for name in ("azimuth_deg", "zenith_deg", "azimuth_stdev_deg", "zenith_stdev_deg"):
+            rows = getattr(self, name)
+            if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
+                raise ValueError(f"{name} must have {shape[0]} rows of {shape[1]} numbers, as the grid has")
+        for name in ("azimuths_deg", "zeniths_deg"):
+            axis = getattr(self, name)
+            if any(b <= a for a, b in pairwise(axis)):
+                raise ValueError(f"{name} must ascend")
+        return self
+
+    def angle_bias(self) -> AngleBias:
+        """Return the bias as the table stores it."""
+        return AngleBias(
+            azimuths=_row(self.azimuths_deg),
+            zeniths=_row(self.zeniths_deg),
+            azimuth=tuple(map(_row, self.azimuth_deg)),
+            zenith=tuple(map(_row, self.zenith_deg)),
+            azimuth_stdev=tuple(map(_row, self.azimuth_stdev_deg)),
+            zenith_stdev=tuple(map(_row, self.zenith_stdev_deg)),
+        )
+
+
+class DeviationsSection(_Section):
+    """``[stations.deviations]``: errors of a station's measurements, taken instead of what reports state."""
+
+    azimuth_deg: Annotated[float, Field(ge=1e-3, le=180)] | None = Field(
+        default=None, description="standard deviation of azimuths"
+    )
+    zenith_deg: Annotated[float, Field(ge=1e-3, le=180)] | None = Field(
+        default=None, description="standard deviation of zenith angles"
+    )
+    range_m: Annotated[float, Field(ge=1e-4, le=10_000)] | None = Field(
+        default=None, description="standard deviation of propagation times and times of arrival as lengths"
+    )
+    tail_share: Annotated[float, Field(ge=0, le=0.5)] = Field(
+        default=0.0, description="probability that an error is of a wider Gaussian"
+    )
+    tail_scale: Annotated[float, Field(ge=1, le=20)] = Field(default=1.0, description="how many times wider that is")
+    correlation_s: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
+        default=None, description="time in which the correlated part of the errors of angles falls to 37 %"
+    )
+    correlated_share: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        default=None, description="share of that part in the variance"
+    )
+
+    def deviations(self) -> Deviations:
+        """Return the deviations as the table stores them."""
+        return Deviations(
+            azimuth=None if self.azimuth_deg is None else float(np.deg2rad(self.azimuth_deg)),
+            zenith=None if self.zenith_deg is None else float(np.deg2rad(self.zenith_deg)),
+            range=self.range_m,
+            tail_share=self.tail_share,
+            tail_scale=self.tail_scale,
+        )
+
+
 class BiasSection(_Section):
     """``[stations.bias]``: systematic errors of a station, measured minus true."""
 
@@ -154,6 +232,9 @@ class BiasSection(_Section):
     )
     angle_stdev_deg: Annotated[float, Field(ge=0, le=90)] = Field(
         default=0.0, description="standard deviation of the azimuth bias and of the zenith bias"
+    )
+    angles: AngleBiasSection | None = Field(
+        default=None, description="what depends on the direction, and comes on top: a table with a grid"
     )
 
 
@@ -205,6 +286,11 @@ class StationSection(_Section):
         description="systematic errors of the station: a table with the keys below",
         json_schema_extra={"effect": "nothing is built again"},
     )
+    deviations: DeviationsSection | None = Field(
+        default=None,
+        description="errors of its measurements, taken instead of what reports state: a table with the keys below",
+        json_schema_extra={"effect": "nothing is built again"},
+    )
 
     @model_validator(mode="after")
     def _turned_once(self) -> "StationSection":
@@ -235,8 +321,10 @@ class StationSection(_Section):
                 azimuth=float(np.deg2rad(bias.azimuth_deg)),
                 zenith=float(np.deg2rad(bias.zenith_deg)),
                 angle_stdev=float(np.deg2rad(bias.angle_stdev_deg)),
+                angles=None if bias.angles is None else bias.angles.angle_bias(),
             ),
             mounting=self.mounting,
+            deviations=None if self.deviations is None else self.deviations.deviations(),
         )
 
     def built_from(self) -> dict[str, Any]:
@@ -378,11 +466,17 @@ def _known_keys(location: tuple[str | int, ...]) -> list[str]:
         "table": TableSection,
         "stations": StationSection,
         "bias": BiasSection,
+        "angles": AngleBiasSection,
+        "deviations": DeviationsSection,
     }
     for part in location:
         if isinstance(part, str) and part in sections:
             model = sections[part]
     return list(model.model_fields)
+
+
+def _row(degrees: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(float(v) for v in np.deg2rad(degrees))
 
 
 def _radians(degrees: Triple) -> Triple:

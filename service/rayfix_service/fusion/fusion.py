@@ -1,5 +1,6 @@
 """Fuse the measurements of a report: the product of their likelihoods and of the prior."""
 
+from rayfix_service.fusion.measurements.calibrated import with_deviations
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fixes import Product
@@ -56,7 +57,7 @@ class Fusion:
 
         The estimate separates quick fixes from slow ones; it is infinite for a report that is slow in any case.
         """
-        return self._cost.seconds(report)
+        return self._cost.seconds(with_deviations(report, self.table.site))
 
     def product(self, report: Report, stop: Stop = NEVER, *, site: SiteInfo | None = None) -> Product:
         """Multiply the likelihoods of the measurements of a report.
@@ -76,7 +77,8 @@ class Fusion:
         FixStoppedError
             When it was stopped.
         """
-        sorted_report = sort_report(report, site or self.table.site)
+        site = site or self.table.site
+        sorted_report = sort_report(with_deviations(report, site), site)
         prior = self._uniform_prior
         if report.height is not None:
             scene = self.table.scene
