@@ -54,6 +54,27 @@ def add_commands(add: AddCommand) -> None:
     add_progress_argument(calibrate)
     calibrate.add_argument("--json", action="store_true", help="print what was found as JSON")
 
+    score = add("score", _score, "compare fixes of a log with true positions")
+    score.add_argument("fixes", type=Path, metavar="FIXES", help="written by rayfix locate -o")
+    score.add_argument(
+        "truth",
+        type=Path,
+        metavar="TRUTH.csv",
+        help="true positions: x_m, y_m, z_m and timestamp, or start and end; also target_id",
+    )
+    score.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="folder for score.html, score.png and score.json"
+    )
+    score.add_argument(
+        "--longest-gap",
+        type=positive,
+        default=2.0,
+        metavar="S",
+        help="time between points of the truth up to which targets moved evenly, s (default: 2; more for way-points)",
+    )
+    score.add_argument("--track", action="store_true", help="score the positions of tracks")
+    score.add_argument("--json", action="store_true", help="print the figures as JSON")
+
 
 def _calibrate(options: argparse.Namespace) -> int:
     with needs_extra("evaluate"):
@@ -80,5 +101,19 @@ def _calibrate(options: argparse.Namespace) -> int:
         print(json.dumps(found.document, indent=2))
     else:
         for line in calibration_lines(found):
+            print(line)
+    return 0
+
+
+def _score(options: argparse.Namespace) -> int:
+    with needs_extra("evaluate"):
+        from rayfix.score import score_fixes, score_lines
+    score = score_fixes(
+        options.fixes, options.truth, options.output, longest_gap=options.longest_gap, use_track=options.track
+    )
+    if options.json:
+        print(json.dumps(score.document, indent=2))
+    else:
+        for line in score_lines(score):
             print(line)
     return 0

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 _SPREAD = 0.7
 """Standard deviation of the logarithm of each hyperparameter about its usual value."""
 
-_JITTER = 1e-6
+_JITTER = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +42,10 @@ class Hyperparameters:
         In which the correlated part falls to 37 %.
     """
 
-    linear: float = 3.0
+    linear: float = 1.5
     amplitude: float = 5.0
     azimuth_scale: float = 25.0
-    zenith_scale: float = 60.0
+    zenith_scale: float = 40.0
     correlated: float = 4.0
     white: float = 2.0
     time: float = 15.0
@@ -149,7 +149,11 @@ def fit_process(samples: Samples, usual: Hyperparameters, *, free: tuple[str, ..
     def cost(logs: Array) -> float:
         if np.abs(logs - start).max() > 4.0:
             return 1e12
-        return -_condition(samples, scales(logs)).log_evidence + 0.5 * float(np.square((logs - start) / _SPREAD).sum())
+        unusual = 0.5 * float(np.square((logs - start) / _SPREAD).sum())
+        try:
+            return unusual - _condition(samples, scales(logs)).log_evidence
+        except np.linalg.LinAlgError:
+            return 1e12
 
     if not free:
         return _condition(samples, usual)
@@ -172,7 +176,8 @@ def _condition(samples: Samples, scales: Hyperparameters) -> Process:
 
 def _smooth(one: Array, other: Array, scales: Hyperparameters) -> Array:
     """Covariance of the smooth part between directions."""
-    azimuth = np.abs(one[:, None, 0] - other[None, :, 0])
-    azimuth = np.minimum(azimuth, 360.0 - azimuth) / scales.azimuth_scale
+    # The chord and not the arc: of arcs around the circle this would be no covariance.
+    chord = np.rad2deg(2.0 * np.sin(0.5 * np.deg2rad(one[:, None, 0] - other[None, :, 0])))
+    azimuth = chord / scales.azimuth_scale
     zenith = (one[:, None, 1] - other[None, :, 1]) / scales.zenith_scale
     return np.asarray(scales.amplitude**2 * np.exp(-0.5 * (azimuth**2 + zenith**2)))

@@ -48,11 +48,18 @@ _FAR = 5.0
 """Robust standard deviations beyond which an error does not shape the systematic part."""
 
 _ANGLES = Hyperparameters()
+
+_USUAL = _ANGLES, replace(_ANGLES, zenith_scale=25.0)
+"""Scales of azimuth and zenith. The bias of an azimuth changes little with the zenith; that of a zenith angle may be of
+reflections from floor and ceiling, which change with it."""
 _TURN_NAMES = ("x", "y", "z")
 _VOLUME = 360.0 * 180.0
 _RANGE_VOLUME = 50.0
 _TILT_RANGE = 120.0
 """Degrees of azimuth from which on tilts are looked for."""
+
+_SURE = 2.0
+"""Standard errors by which a smaller model must be better at a station to be preferred there."""
 
 _KNOWN = 0.6
 """Ratio of posterior and prior deviation above which a term is named as not covered."""
@@ -192,7 +199,7 @@ def chosen_models(trials: Sequence[AngleTrial]) -> list[Model]:
         model: Model = best
         for smaller in MODELS[: MODELS.index(best)]:
             better = trial.gain[smaller] - trial.gain[model]
-            if better.sum() > np.sqrt(len(better)) * max(float(better.std()), 1e-9):
+            if better.sum() > _SURE * np.sqrt(len(better)) * max(float(better.std()), 1e-9):
                 model = smaller
         found.append(model)
     return found
@@ -262,7 +269,7 @@ def _features(errors: AngleErrors, true: Array) -> list[Array]:
 
 
 def _fit(errors: AngleErrors, model: Model, chosen: NDArray[np.bool_] | None = None) -> tuple[Process, ...]:
-    """Fit the processes of azimuth and zenith; turns about the horizontal axes show in both and are fitted with both."""
+    """Fit the processes of azimuth and zenith to all errors, or to those that are chosen."""
     chosen = np.ones(len(errors.seconds), bool) if chosen is None else chosen
     columns = 2 if _has_zenith(errors) else 1
     found = []
@@ -270,18 +277,18 @@ def _fit(errors: AngleErrors, model: Model, chosen: NDArray[np.bool_] | None = N
         good = chosen & _near(errors.error[:, column], chosen)
         features = _features(errors, errors.true)[column]
         samples = _means(errors, column, features, good)
-        found.append(_process(samples, model))
+        found.append(_process(samples, model, _USUAL[column]))
     return tuple(found)
 
 
-def _process(samples: Samples, model: Model) -> Process:
+def _process(samples: Samples, model: Model, usual: Hyperparameters) -> Process:
     match model:
         case "none":
-            usual, free = replace(_ANGLES, linear=1e-6, amplitude=0.0), ()
+            usual, free = replace(usual, linear=1e-6, amplitude=0.0), ()
         case "constant":
-            usual, free = replace(_ANGLES, amplitude=0.0), ("linear",)
+            usual, free = replace(usual, amplitude=0.0), ("linear",)
         case "smooth":
-            usual, free = _ANGLES, ("linear", "amplitude", "azimuth_scale", "zenith_scale")
+            free = ("linear", "amplitude", "azimuth_scale", "zenith_scale")
     scatter = max(float(np.std(samples.error)), 1e-3)
     usual = replace(
         usual, linear=min(usual.linear, scatter), amplitude=min(usual.amplitude, scatter), correlated=0.6 * scatter,
@@ -366,9 +373,7 @@ def _constants(
     for n, name in enumerate(_TURN_NAMES):
         if deviation[n] > _KNOWN * max(scales):
             mean[n] = 0.0
-            notes.append(
-                f"its turn about {name} is not told: it was seen from {low:.0f} to {high:.0f} deg of azimuth only"
-            )
+            notes.append(f"its turn about {name} is not told: {seen}")
     constant[1], stdev[1] = mean[3], deviation[3]
     return mean[:3], deviation[:3], constant, stdev, tuple(notes)
 

@@ -86,8 +86,8 @@ class Truth:
 def read_truth(path: Path, *, longest_gap: float = LONGEST_GAP) -> Truth:
     """Read the truth from a CSV file.
 
-    Columns are x_m, y_m, z_m, optionally target_id, and either ``timestamp`` or ``start`` and ``end``. Times are RFC 3339,
-    or since 1970 where the name ends in the unit: ``timestamp_ms``, ``start_s``.
+    Columns are x_m, y_m, z_m, optionally target_id, and either ``timestamp`` or ``start`` and ``end``. Times are RFC
+    3339, or since 1970 where the name ends in the unit: ``timestamp_ms``, ``start_s``.
 
     Parameters
     ----------
