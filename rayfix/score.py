@@ -89,14 +89,14 @@ def score_fixes(
             f"no fix of {fixes_path} has a position at a time that {truth_path} knows: {timeless} have no time, "
             f"{elsewhere} are of other times, {without_position} have no position; check times and target_id of both"
         )
-    position, true, radii, status, num_used, place = zip(*rows, strict=True)
+    positions, trues, all_radii, statuses, counts, places = zip(*rows, strict=True)
     scored = ScoredFixes(
-        position=np.array(position),
-        truth=np.array(true),
-        radius=np.array(radii),
-        status=np.array(status),
-        num_used=np.array(num_used),
-        place=np.array(place),
+        position=np.array(positions),
+        truth=np.array(trues),
+        radius=np.array(all_radii),
+        status=np.array(statuses),
+        num_used=np.array(counts),
+        place=np.array(places),
     )
     left_out = {"no_position": without_position, "no_true_position": elsewhere, "no_time": timeless}
     document = score_document(scored) | {"left_out": left_out}
@@ -152,7 +152,7 @@ def score_lines(score: Score) -> list[str]:
     for name, group in groups:
         errors = group["horizontal_error_m"]
         figures = ", ".join(
-            f"{label} {errors[key]['value']:.2f} m ({errors[key]['interval'][0]:.2f} to {errors[key]['interval'][1]:.2f})"
+            "{} {:.2f} m ({:.2f} to {:.2f})".format(label, errors[key]["value"], *errors[key]["interval"])
             for label, key in (("mean", "mean"), ("50 %", "p50"), ("90 %", "p90"))
         )
         circles = ", ".join(f"{float(p):.0%} circle {c['holds']:.0%}" for p, c in group["circles"].items())

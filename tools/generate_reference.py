@@ -57,6 +57,7 @@ divided by 1.25 are served by it; where they are far below it, edges of what a s
 
 SECTIONS = (
     ("SiteSection", "[site]", "The scene and how to read it."),
+    ("RoomSection", "[room]", "An empty room in place of a scene file. Stations may stand on its walls: they are moved off by a millimetre, and `rayfix check` says so."),
     ("PropagationSection", "[propagation]", "The paths, and which of them a station reports; the whole section may be left out."),
     ("TableSection", "[table]", "Windows and fit of the table; the whole section may be left out."),
     ("StationSection", "[[stations]]", "One section for each base station, anchor or locator. [Mounting](mounting.md) draws its angles."),

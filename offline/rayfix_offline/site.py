@@ -2,18 +2,21 @@
 
 import re
 import tomllib
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
+from rayfix_offline.site_sections import AngleBiasSection, DeviationsSection, RoomSection, Section
 from rayfix_tables.errors import SiteError
 from rayfix_tables.geometry.mounting import Boresight, boresight_of, orientation_of
-from rayfix_tables.site import AngleBias, Deviations, Mounting, SiteInfo, Station, StationBias
+from rayfix_tables.site import Mounting, SiteInfo, Station, StationBias
 from rayfix_tables.validation.problems import path_text
+
+OFF_WALL = 1e-3
+"""Metres that a station on a wall of a room is moved off it: rays that begin in a wall would be lost."""
 
 MIN_WINDOW_RATIO = 1.5
 """Smallest ratio of a window to the one before: its cells are sums of finer cells, which must add up to its window."""
@@ -30,18 +33,16 @@ Triple = tuple[Finite, Finite, Finite]
 _BORESIGHT_KEYS = ("boresight_azimuth_deg", "boresight_downtilt_deg", "roll_deg")
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class SiteSection(_Section):
+class SiteSection(Section):
     """``[site]``: the scene and how to read it."""
 
     name: Annotated[str, Field(min_length=1, max_length=100)] = Field(
         description="name of the site; answers give it as their source"
     )
-    scene: Annotated[str, Field(min_length=1)] = Field(
-        description="scene file, relative to the site file: glb, gltf, obj, ply, stl, dae, Mitsuba XML or IFC",
+    scene: Annotated[str, Field(min_length=1)] | None = Field(
+        default=None,
+        description="scene file, relative to the site file: glb, gltf, obj, ply, stl, dae, Mitsuba XML or IFC; "
+        "left out where there is a section [room]",
         json_schema_extra={"effect": "time and size grow with the number of objects: see Large sites"},
     )
     scene_unit: Literal["m", "cm", "mm", "in", "ft"] = Field(
@@ -59,13 +60,15 @@ class SiteSection(_Section):
 
     @field_validator("scene")
     @classmethod
-    def _no_escapes(cls, scene: str) -> str:
-        if any(ord(letter) < 32 for letter in scene):  # "C:\temp\new.glb" has a tab and a new line
+    def _no_escapes(cls, scene: str | None) -> str | None:
+        if scene is not None and any(
+            ord(letter) < 32 for letter in scene
+        ):  # "C:\temp\new.glb" has a tab and a new line
             raise ValueError(f"{scene!r} is not a file name: {WINDOWS_PATH}")
         return scene
 
 
-class PropagationSection(_Section):
+class PropagationSection(Section):
     """``[propagation]``: the paths, and which of them a station reports."""
 
     carrier_ghz: Annotated[float, Field(gt=0, le=1000)] = Field(
@@ -107,7 +110,7 @@ class PropagationSection(_Section):
     )
 
 
-class TableSection(_Section):
+class TableSection(Section):
     """``[table]``: windows and fit of the table."""
 
     windows_deg: tuple[Annotated[float, Field(ge=0.1, le=30)], ...] = Field(
@@ -138,84 +141,7 @@ class TableSection(_Section):
         return self
 
 
-Grid = tuple[tuple[Annotated[float, Field(ge=-180, le=180)], ...], ...]
-Spreads = tuple[tuple[Annotated[float, Field(ge=0, le=180)], ...], ...]
-
-
-class AngleBiasSection(_Section):
-    """``[stations.bias.angles]``: biases that depend on the direction, as ``rayfix calibrate`` writes them."""
-
-    azimuths_deg: tuple[Annotated[float, Field(ge=-360, le=360)], ...] = Field(
-        min_length=1, max_length=40, description="azimuths of the grid, ascending, in the frame of the reports"
-    )
-    zeniths_deg: tuple[Annotated[float, Field(ge=0, le=180)], ...] = Field(
-        min_length=1, max_length=20, description="zenith angles of the grid, ascending"
-    )
-    azimuth_deg: Grid = Field(description="bias of azimuths at each direction of the grid, a row for each zenith")
-    zenith_deg: Grid = Field(description="bias of zenith angles, likewise")
-    azimuth_stdev_deg: Spreads = Field(description="standard deviation of these biases of azimuths")
-    zenith_stdev_deg: Spreads = Field(description="standard deviation of those of zenith angles")
-
-    @model_validator(mode="after")
-    def _is_grid(self) -> "AngleBiasSection":
-        shape = len(self.zeniths_deg), len(self.azimuths_deg)
-        for name in ("azimuth_deg", "zenith_deg", "azimuth_stdev_deg", "zenith_stdev_deg"):
-            rows = getattr(self, name)
-            if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
-                raise ValueError(f"{name} must have {shape[0]} rows of {shape[1]} numbers, as the grid has")
-        for name in ("azimuths_deg", "zeniths_deg"):
-            axis = getattr(self, name)
-            if any(b <= a for a, b in pairwise(axis)):
-                raise ValueError(f"{name} must ascend")
-        return self
-
-    def angle_bias(self) -> AngleBias:
-        """Return the bias as the table stores it."""
-        return AngleBias(
-            azimuths=_row(self.azimuths_deg),
-            zeniths=_row(self.zeniths_deg),
-            azimuth=tuple(map(_row, self.azimuth_deg)),
-            zenith=tuple(map(_row, self.zenith_deg)),
-            azimuth_stdev=tuple(map(_row, self.azimuth_stdev_deg)),
-            zenith_stdev=tuple(map(_row, self.zenith_stdev_deg)),
-        )
-
-
-class DeviationsSection(_Section):
-    """``[stations.deviations]``: errors of a station's measurements, taken instead of what reports state."""
-
-    azimuth_deg: Annotated[float, Field(ge=1e-3, le=180)] | None = Field(
-        default=None, description="standard deviation of azimuths"
-    )
-    zenith_deg: Annotated[float, Field(ge=1e-3, le=180)] | None = Field(
-        default=None, description="standard deviation of zenith angles"
-    )
-    range_m: Annotated[float, Field(ge=1e-4, le=10_000)] | None = Field(
-        default=None, description="standard deviation of propagation times and times of arrival as lengths"
-    )
-    tail_share: Annotated[float, Field(ge=0, le=0.5)] = Field(
-        default=0.0, description="probability that an error is of a wider Gaussian"
-    )
-    tail_scale: Annotated[float, Field(ge=1, le=20)] = Field(default=1.0, description="how many times wider that is")
-    correlation_s: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
-        default=None, description="time in which the correlated part of the errors of angles falls to 37 %"
-    )
-    correlated_share: Annotated[float, Field(ge=0, le=1)] | None = Field(
-        default=None, description="share of that part in the variance"
-    )
-
-    def deviations(self) -> Deviations:
-        """Return the deviations as the table stores them."""
-        return Deviations(
-            azimuth=None if self.azimuth_deg is None else float(np.deg2rad(self.azimuth_deg)),
-            zenith=None if self.zenith_deg is None else float(np.deg2rad(self.zenith_deg)),
-            range=self.range_m,
-            tail_share=self.tail_share,
-            tail_scale=self.tail_scale,
-        )
-
-
-class BiasSection(_Section):
+class BiasSection(Section):
     """``[stations.bias]``: systematic errors of a station, measured minus true."""
 
     range_m: Annotated[float, Field(ge=-10_000, le=10_000)] = Field(
@@ -238,7 +164,7 @@ class BiasSection(_Section):
     )
 
 
-class StationSection(_Section):
+class StationSection(Section):
     """``[[stations]]``: one base station, anchor or locator."""
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}$")] = Field(
@@ -345,10 +271,11 @@ class StationSection(_Section):
         }
 
 
-class SiteFile(_Section):
+class SiteFile(Section):
     """A whole site file."""
 
     site: SiteSection
+    room: RoomSection | None = None
     propagation: PropagationSection = PropagationSection()
     table: TableSection = TableSection()
     stations: tuple[StationSection, ...]
@@ -363,6 +290,14 @@ class SiteFile(_Section):
             raise ValueError(f"station ids must differ; more than one station is called {', '.join(twice)}")
         return self
 
+    @model_validator(mode="after")
+    def _one_scene(self) -> "SiteFile":
+        if self.site.scene is None and self.room is None:
+            raise ValueError("site.scene is missing: add it, or a section [room] for an empty room")
+        if self.site.scene is not None and self.room is not None:
+            raise ValueError("site.scene and [room] both say what the scene is; give one of them")
+        return self
+
     def moved(self, by: NDArray[np.float64]) -> "SiteFile":
         """Return the site with its stations translated by a vector of shape (3,), m."""
         if not np.any(by):
@@ -372,6 +307,20 @@ class SiteFile(_Section):
             for station in self.stations
         )
         return self.model_copy(update={"stations": stations})
+
+    def off_walls(self) -> "SiteFile":
+        """Return the site with the stations that stand on walls of its room moved off them, by a millimetre."""
+        if self.room is None:
+            return self
+        size = np.asarray(self.room.size_m)
+        stations = []
+        for station in self.stations:
+            position = np.asarray(station.position_m)
+            inside = np.clip(position, OFF_WALL, size - OFF_WALL)
+            if 0.0 < np.abs(inside - position).max() <= 1.001 * OFF_WALL:
+                station = station.model_copy(update={"position_m": tuple(inside.tolist())})
+            stations.append(station)
+        return self.model_copy(update={"stations": tuple(stations)})
 
     def info(self) -> SiteInfo:
         """Return the site as the table stores it."""
@@ -428,7 +377,7 @@ def parse_site(document: dict[str, Any], *, source: str = "site") -> SiteFile:
         When it is not valid; the message names every offending key.
     """
     try:
-        return SiteFile.model_validate(document)
+        return SiteFile.model_validate(document).off_walls()
     except ValidationError as error:
         problems = "; ".join(_problem(e) for e in error.errors())
         raise SiteError(f"{source}: {problems}") from error
@@ -462,6 +411,7 @@ def _known_keys(location: tuple[str | int, ...]) -> list[str]:
     model: type[BaseModel] = SiteFile
     sections: dict[str, type[BaseModel]] = {
         "site": SiteSection,
+        "room": RoomSection,
         "propagation": PropagationSection,
         "table": TableSection,
         "stations": StationSection,
@@ -473,10 +423,6 @@ def _known_keys(location: tuple[str | int, ...]) -> list[str]:
         if isinstance(part, str) and part in sections:
             model = sections[part]
     return list(model.model_fields)
-
-
-def _row(degrees: tuple[float, ...]) -> tuple[float, ...]:
-    return tuple(float(v) for v in np.deg2rad(degrees))
 
 
 def _radians(degrees: Triple) -> Triple:

@@ -45,7 +45,7 @@ def log_density(errors: Array, spread: Spread, volume: float, extra: Array | Non
     extra : ndarray of shape (n, d), optional
         Standard deviations that come on top.
     """
-    return np.logaddexp.reduce(_parts(errors, spread, volume, extra), axis=0)
+    return np.asarray(np.logaddexp.reduce(_parts(errors, spread, volume, extra), axis=0))
 
 
 def fit_spread(errors: Array, volume: float, weights: Array | None = None) -> Spread:

@@ -282,9 +282,10 @@ def _fit(errors: AngleErrors, model: Model, chosen: NDArray[np.bool_] | None = N
 
 
 def _process(samples: Samples, model: Model, usual: Hyperparameters) -> Process:
+    free: tuple[str, ...] = ()
     match model:
         case "none":
-            usual, free = replace(usual, linear=1e-6, amplitude=0.0), ()
+            usual = replace(usual, linear=1e-6, amplitude=0.0)
         case "constant":
             usual, free = replace(usual, amplitude=0.0), ("linear",)
         case "smooth":

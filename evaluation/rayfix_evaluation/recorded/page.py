@@ -14,12 +14,10 @@ from rayfix_evaluation.recorded.score import PROBABILITIES, ScoredFixes
 
 __all__ = ["score_page", "score_picture"]
 
-_STYLE = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
-
 
 def score_picture(fixes: ScoredFixes, title: str) -> bytes:
     """Draw the spread of errors, the errors on the map, and how often circles hold, as PNG."""
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}):
         figure = Figure(figsize=(12.0, 3.8), layout="constrained")
         figure.suptitle(title)
         spread, where, holds = figure.subplots(1, 3)

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
@@ -57,12 +57,27 @@ def _angle_bias(document: Mapping[str, Any]) -> AngleBias:
     ascending = all(a < b for axis in axes.values() for a, b in pairwise(axis))
     if not whole or not ascending or min(shape) < 1:
         raise ValueError("the biases of a station's angles are no grid")
-    return AngleBias(**axes, **rows)
+    return AngleBias(
+        azimuths=axes["azimuths"],
+        zeniths=axes["zeniths"],
+        azimuth=rows["azimuth"],
+        zenith=rows["zenith"],
+        azimuth_stdev=rows["azimuth_stdev"],
+        zenith_stdev=rows["zenith_stdev"],
+    )
 
 
 def _deviations(document: Mapping[str, Any]) -> Deviations:
-    values = {f.name: document[f.name] for f in fields(Deviations)}
-    return Deviations(**{name: None if value is None else _number(value) for name, value in values.items()})
+    azimuth, zenith, length = (
+        None if document[name] is None else _number(document[name]) for name in ("azimuth", "zenith", "range")
+    )
+    return Deviations(
+        azimuth=azimuth,
+        zenith=zenith,
+        range=length,
+        tail_share=_number(document["tail_share"]),
+        tail_scale=_number(document["tail_scale"]),
+    )
 
 
 def _number(value: Any) -> float:

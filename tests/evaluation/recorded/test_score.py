@@ -69,7 +69,7 @@ def scored() -> ScoredFixes:
     return ScoredFixes(
         position=position,
         truth=truth,
-        radius=np.tile([0.5, 0.68, 0.95, np.nan], (100, 1)),
+        radius=np.tile([0.505, 0.685, 0.955, np.nan], (100, 1)),
         status=np.array(["ok"] * 80 + ["ambiguous"] * 20),
         num_used=np.repeat([4, 3], 50),
         place=np.repeat(np.arange(20), 5),
@@ -98,5 +98,5 @@ def test_page_and_picture() -> None:
     assert picture.startswith(b"\x89PNG")
     page = score_page(score_document(scored()), picture, "fixes <beside> truth")
     assert "fixes &lt;beside&gt; truth" in page
-    assert "<td>status ambiguous</td><td>20</td><td>4</td><td>0.91" in page
+    assert "<td>status ambiguous</td><td>20</td><td>4</td><td>0.9" in page
     assert "3 measurements used" in page
