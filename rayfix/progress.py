@@ -64,17 +64,17 @@ def _build_bar() -> Iterator[Show]:
 
 
 @contextmanager
-def evaluation_progress(*, enabled: bool) -> Iterator[Show]:
-    """Show each stage of an evaluation and its remaining time on standard error."""
+def stage_progress(*, enabled: bool) -> Iterator[Show]:
+    """Show each stage of a long job and its remaining time on standard error."""
     if not enabled:
         yield lambda stage, done, total: None
         return
-    with _evaluation_bars() if sys.stderr.isatty() else _lines() as show:
+    with _stage_bars() if sys.stderr.isatty() else _lines() as show:
         yield show
 
 
 @contextmanager
-def _evaluation_bars() -> Iterator[Show]:
+def _stage_bars() -> Iterator[Show]:
     bar = Progress(
         TextColumn("{task.description:<24}"),
         BarColumn(bar_width=24),

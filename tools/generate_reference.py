@@ -57,10 +57,13 @@ divided by 1.25 are served by it; where they are far below it, edges of what a s
 
 SECTIONS = (
     ("SiteSection", "[site]", "The scene and how to read it."),
+    ("RoomSection", "[room]", "An empty room in place of a scene file. Stations may stand on its walls: they are moved off by a millimetre, and `rayfix check` says so."),
     ("PropagationSection", "[propagation]", "The paths, and which of them a station reports; the whole section may be left out."),
     ("TableSection", "[table]", "Windows and fit of the table; the whole section may be left out."),
     ("StationSection", "[[stations]]", "One section for each base station, anchor or locator. [Mounting](mounting.md) draws its angles."),
     ("BiasSection", "bias of a station", "Measured minus true; the fusion takes it off. [Measurements](measurements.md#bias-of-a-station)."),
+    ("AngleBiasSection", "bias that depends on the direction", "Written by `rayfix calibrate`; between the directions of the grid the fusion interpolates. [Calibration](calibration.md)."),
+    ("DeviationsSection", "errors of a station's measurements", "Written by `rayfix calibrate`; the fusion takes them instead of what reports state. [Calibration](calibration.md)."),
 )  # fmt: skip
 
 COMMAND_HEAD = """\

@@ -7,12 +7,16 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
+from rayfix_offline.site_sections import AngleBiasSection, DeviationsSection, RoomSection, Section
 from rayfix_tables.errors import SiteError
 from rayfix_tables.geometry.mounting import Boresight, boresight_of, orientation_of
 from rayfix_tables.site import Mounting, SiteInfo, Station, StationBias
 from rayfix_tables.validation.problems import path_text
+
+OFF_WALL = 1e-3
+"""Metres that a station on a wall of a room is moved off it: rays that begin in a wall would be lost."""
 
 MIN_WINDOW_RATIO = 1.5
 """Smallest ratio of a window to the one before: its cells are sums of finer cells, which must add up to its window."""
@@ -29,18 +33,16 @@ Triple = tuple[Finite, Finite, Finite]
 _BORESIGHT_KEYS = ("boresight_azimuth_deg", "boresight_downtilt_deg", "roll_deg")
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class SiteSection(_Section):
+class SiteSection(Section):
     """``[site]``: the scene and how to read it."""
 
     name: Annotated[str, Field(min_length=1, max_length=100)] = Field(
         description="name of the site; answers give it as their source"
     )
-    scene: Annotated[str, Field(min_length=1)] = Field(
-        description="scene file, relative to the site file: glb, gltf, obj, ply, stl, dae, Mitsuba XML or IFC",
+    scene: Annotated[str, Field(min_length=1)] | None = Field(
+        default=None,
+        description="scene file, relative to the site file: glb, gltf, obj, ply, stl, dae, Mitsuba XML or IFC; "
+        "left out where there is a section [room]",
         json_schema_extra={"effect": "time and size grow with the number of objects: see Large sites"},
     )
     scene_unit: Literal["m", "cm", "mm", "in", "ft"] = Field(
@@ -58,13 +60,15 @@ class SiteSection(_Section):
 
     @field_validator("scene")
     @classmethod
-    def _no_escapes(cls, scene: str) -> str:
-        if any(ord(letter) < 32 for letter in scene):  # "C:\temp\new.glb" has a tab and a new line
+    def _no_escapes(cls, scene: str | None) -> str | None:
+        if scene is not None and any(
+            ord(letter) < 32 for letter in scene
+        ):  # "C:\temp\new.glb" has a tab and a new line
             raise ValueError(f"{scene!r} is not a file name: {WINDOWS_PATH}")
         return scene
 
 
-class PropagationSection(_Section):
+class PropagationSection(Section):
     """``[propagation]``: the paths, and which of them a station reports."""
 
     carrier_ghz: Annotated[float, Field(gt=0, le=1000)] = Field(
@@ -106,7 +110,7 @@ class PropagationSection(_Section):
     )
 
 
-class TableSection(_Section):
+class TableSection(Section):
     """``[table]``: windows and fit of the table."""
 
     windows_deg: tuple[Annotated[float, Field(ge=0.1, le=30)], ...] = Field(
@@ -137,7 +141,7 @@ class TableSection(_Section):
         return self
 
 
-class BiasSection(_Section):
+class BiasSection(Section):
     """``[stations.bias]``: systematic errors of a station, measured minus true."""
 
     range_m: Annotated[float, Field(ge=-10_000, le=10_000)] = Field(
@@ -155,9 +159,12 @@ class BiasSection(_Section):
     angle_stdev_deg: Annotated[float, Field(ge=0, le=90)] = Field(
         default=0.0, description="standard deviation of the azimuth bias and of the zenith bias"
     )
+    angles: AngleBiasSection | None = Field(
+        default=None, description="what depends on the direction, and comes on top: a table with a grid"
+    )
 
 
-class StationSection(_Section):
+class StationSection(Section):
     """``[[stations]]``: one base station, anchor or locator."""
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}$")] = Field(
@@ -205,6 +212,11 @@ class StationSection(_Section):
         description="systematic errors of the station: a table with the keys below",
         json_schema_extra={"effect": "nothing is built again"},
     )
+    deviations: DeviationsSection | None = Field(
+        default=None,
+        description="errors of its measurements, taken instead of what reports state: a table with the keys below",
+        json_schema_extra={"effect": "nothing is built again"},
+    )
 
     @model_validator(mode="after")
     def _turned_once(self) -> "StationSection":
@@ -235,8 +247,10 @@ class StationSection(_Section):
                 azimuth=float(np.deg2rad(bias.azimuth_deg)),
                 zenith=float(np.deg2rad(bias.zenith_deg)),
                 angle_stdev=float(np.deg2rad(bias.angle_stdev_deg)),
+                angles=None if bias.angles is None else bias.angles.angle_bias(),
             ),
             mounting=self.mounting,
+            deviations=None if self.deviations is None else self.deviations.deviations(),
         )
 
     def built_from(self) -> dict[str, Any]:
@@ -257,10 +271,11 @@ class StationSection(_Section):
         }
 
 
-class SiteFile(_Section):
+class SiteFile(Section):
     """A whole site file."""
 
     site: SiteSection
+    room: RoomSection | None = None
     propagation: PropagationSection = PropagationSection()
     table: TableSection = TableSection()
     stations: tuple[StationSection, ...]
@@ -275,6 +290,14 @@ class SiteFile(_Section):
             raise ValueError(f"station ids must differ; more than one station is called {', '.join(twice)}")
         return self
 
+    @model_validator(mode="after")
+    def _one_scene(self) -> "SiteFile":
+        if self.site.scene is None and self.room is None:
+            raise ValueError("site.scene is missing: add it, or a section [room] for an empty room")
+        if self.site.scene is not None and self.room is not None:
+            raise ValueError("site.scene and [room] both say what the scene is; give one of them")
+        return self
+
     def moved(self, by: NDArray[np.float64]) -> "SiteFile":
         """Return the site with its stations translated by a vector of shape (3,), m."""
         if not np.any(by):
@@ -284,6 +307,20 @@ class SiteFile(_Section):
             for station in self.stations
         )
         return self.model_copy(update={"stations": stations})
+
+    def off_walls(self) -> "SiteFile":
+        """Return the site with the stations that stand on walls of its room moved off them, by a millimetre."""
+        if self.room is None:
+            return self
+        size = np.asarray(self.room.size_m)
+        stations = []
+        for station in self.stations:
+            position = np.asarray(station.position_m)
+            inside = np.clip(position, OFF_WALL, size - OFF_WALL)
+            if 0.0 < np.abs(inside - position).max() <= 1.001 * OFF_WALL:
+                station = station.model_copy(update={"position_m": tuple(inside.tolist())})
+            stations.append(station)
+        return self.model_copy(update={"stations": tuple(stations)})
 
     def info(self) -> SiteInfo:
         """Return the site as the table stores it."""
@@ -340,7 +377,7 @@ def parse_site(document: dict[str, Any], *, source: str = "site") -> SiteFile:
         When it is not valid; the message names every offending key.
     """
     try:
-        return SiteFile.model_validate(document)
+        return SiteFile.model_validate(document).off_walls()
     except ValidationError as error:
         problems = "; ".join(_problem(e) for e in error.errors())
         raise SiteError(f"{source}: {problems}") from error
@@ -374,10 +411,13 @@ def _known_keys(location: tuple[str | int, ...]) -> list[str]:
     model: type[BaseModel] = SiteFile
     sections: dict[str, type[BaseModel]] = {
         "site": SiteSection,
+        "room": RoomSection,
         "propagation": PropagationSection,
         "table": TableSection,
         "stations": StationSection,
         "bias": BiasSection,
+        "angles": AngleBiasSection,
+        "deviations": DeviationsSection,
     }
     for part in location:
         if isinstance(part, str) and part in sections:

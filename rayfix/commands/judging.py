@@ -77,9 +77,9 @@ def _evaluate(options: argparse.Namespace) -> int:
         from rayfix_evaluation.report.write import PAGE, run_evaluation
 
     from rayfix.console import print_evaluation
-    from rayfix.progress import evaluation_progress
+    from rayfix.progress import stage_progress
 
-    with evaluation_progress(enabled=not options.no_progress) as progress:
+    with stage_progress(enabled=not options.no_progress) as progress:
         found = run_evaluation(
             options.site,
             options.output,

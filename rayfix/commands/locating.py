@@ -9,11 +9,14 @@ from rayfix.commands.arguments import (
     AddCommand,
     add_confidence_argument,
     add_hub_argument,
+    add_jobs_argument,
     add_output_arguments,
+    add_progress_argument,
     at_least_one,
     hub_settings,
 )
 from rayfix.commands.broker import PASSWORD_VARIABLE
+from rayfix.commands.logs import add_log_arguments, angle_errors, check_one_report, log_reading
 from rayfix.extras import needs_extra
 
 _INPUTS = ("native", "nrppa", "silabs", "ublox")
@@ -21,10 +24,20 @@ _INPUTS = ("native", "nrppa", "silabs", "ublox")
 
 def add_commands(add: AddCommand) -> None:
     """Add the commands to the command line."""
-    locate = add("locate", _locate, "locate the reports of a file")
+    locate = add("locate", _locate, "locate a report, or all reports of recorded logs")
     locate.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
-    locate.add_argument("report", type=Path, metavar="REPORT.json", help="file with the measurements")
-    locate.add_argument("--format", choices=_INPUTS, default="native", help="format of the report (default: native)")
+    locate.add_argument(
+        "reports", type=Path, nargs="+", metavar="LOG", help="file with a report, or logs: JSON or CSV, also gzip"
+    )
+    locate.add_argument(
+        "-o",
+        "--fixes",
+        type=Path,
+        metavar="FIXES",
+        help="write the fixes of all reports to this file: .jsonl, .csv, .geojson or .parquet; "
+        "without it, one report is located and printed",
+    )
+    locate.add_argument("--format", choices=_INPUTS, default="native", help="format of the reports (default: native)")
     add_output_arguments(locate)
     add_confidence_argument(locate)
     locate.add_argument(
@@ -38,7 +51,15 @@ def add_commands(add: AddCommand) -> None:
         help="probability that such an error has a wider Gaussian distribution, and by what factor it is wider "
         "(default: 0.2 3)",
     )
-    locate.add_argument("--json", action="store_true", help="print the answer as JSON, as the HTTP interface does")
+    locate.add_argument(
+        "--json",
+        action="store_true",
+        help="print the answer, or the summary of logs, as JSON, as the HTTP interface does",
+    )
+    add_log_arguments(locate)
+    locate.add_argument("--track", action="store_true", help="follow the targets of logs from report to report")
+    add_jobs_argument(locate, "processes that locate the reports of logs")
+    add_progress_argument(locate)
 
     mqtt = add("mqtt", _mqtt, "locate from an MQTT broker: read angles of Silicon Labs locators, publish positions")
     mqtt.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
@@ -72,25 +93,22 @@ def add_commands(add: AddCommand) -> None:
 
 
 def _locate(options: argparse.Namespace) -> int:
+    if options.fixes is not None:
+        return _locate_logs(options)
+    check_one_report(options)
     with needs_extra("service"):
         from rayfix.console import print_fix
         from rayfix.locate import locate_file
         from rayfix_service.adapters.adapted import known_height, station_map
-        from rayfix_service.adapters.ublox import USUAL_ERRORS, AngleErrors
-    errors = None
-    if options.stdev is not None or options.tails is not None:
-        share, scale = options.tails or (USUAL_ERRORS.tail_share, USUAL_ERRORS.tail_scale)
-        stdev = USUAL_ERRORS.stdev_deg if options.stdev is None else options.stdev
-        errors = AngleErrors(stdev_deg=stdev, tail_share=share, tail_scale=scale)
     answers = locate_file(
         options.table,
-        options.report,
+        options.reports[0],
         input_format=options.format,
         output_format=options.output,
         stations=station_map(options.station),
         height=known_height(*(options.height or (None, None))),
         confidence=options.confidence,
-        errors=errors,
+        errors=angle_errors(options),
     )
     for document in answers:
         if options.json or options.output != "native":
@@ -100,6 +118,37 @@ def _locate(options: argparse.Namespace) -> int:
             if len(answers) > 1:
                 print(f"{document['target_id']}:")
             print_fix(document)
+    return 0
+
+
+def _locate_logs(options: argparse.Namespace) -> int:
+    with needs_extra("service"):
+        from rayfix.logs.layouts import layout_of
+        from rayfix.logs.locating import Task
+        from rayfix.logs.run import locate_logs
+        from rayfix_service.adapters.adapted import known_height
+        from rayfix_tables.checked import open_checked
+
+    from rayfix.console_logs import print_log_run
+    from rayfix.progress import stage_progress
+
+    layout = layout_of(options.fixes)
+    table = open_checked(options.table)
+    task = Task(
+        table_path=options.table.resolve(),
+        table_id=table.table_id,
+        layout=layout,
+        output_format=options.output,
+        height=known_height(*(options.height or (None, None))),
+        confidence=options.confidence,
+        track=options.track,
+    )
+    reading = log_reading(options, table)
+    with stage_progress(enabled=not options.no_progress) as progress:
+        run = locate_logs(
+            table, options.reports, options.fixes, task=task, reading=reading, jobs=options.jobs, progress=progress
+        )
+    print_log_run(run, options.fixes, as_json=options.json)
     return 0
 
 

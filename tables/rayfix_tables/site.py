@@ -12,6 +12,54 @@ Mounting = Literal["3gpp", "silabs", "ublox"]
 """Local frame of an array, by who defines it; :mod:`rayfix_tables.geometry.mounting` has their axes."""
 
 
+Rows = tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AngleBias:
+    """Bias of a station's angles that depends on the direction; between the directions of the grid it is interpolated.
+
+    Beyond the grid it is that of the nearest edge.
+
+    Attributes
+    ----------
+    azimuths, zeniths : tuple of float, rad
+        The grid, ascending: true directions, in the frame in which the station reports them.
+    azimuth, zenith : tuple of tuples of float, rad
+        Biases, measured minus true, a row for each zenith.
+    azimuth_stdev, zenith_stdev : tuple of tuples of float, rad
+        Their standard deviations.
+    """
+
+    azimuths: tuple[float, ...]
+    zeniths: tuple[float, ...]
+    azimuth: Rows
+    zenith: Rows
+    azimuth_stdev: Rows
+    zenith_stdev: Rows
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deviations:
+    """Errors of a station's measurements as a calibration found them; the fusion takes them instead of the stated ones.
+
+    Attributes
+    ----------
+    azimuth, zenith : float or None, rad
+        Standard deviations of angles; None leaves those that reports state.
+    range : float or None, m
+        Of times as lengths.
+    tail_share, tail_scale : float
+        Of heavy tails, as in an error model of a report; they go with the deviations.
+    """
+
+    azimuth: float | None = None
+    zenith: float | None = None
+    range: float | None = None
+    tail_share: float = 0.0
+    tail_scale: float = 1.0
+
+
 @dataclass(frozen=True, kw_only=True)
 class StationBias:
     """Systematic error of a station: measured minus true. The fusion subtracts it; the table does not depend on it.
@@ -25,6 +73,8 @@ class StationBias:
         Biases of the angles, in the frame in which the station reports them.
     angle_stdev : float, rad
         Standard deviation of each of these two.
+    angles : AngleBias, optional
+        What depends on the direction; it comes on top.
     """
 
     range: float = 0.0
@@ -32,6 +82,7 @@ class StationBias:
     azimuth: float = 0.0
     zenith: float = 0.0
     angle_stdev: float = 0.0
+    angles: AngleBias | None = None
 
 
 NO_BIAS = StationBias()
@@ -52,6 +103,7 @@ class Station:
     bias : StationBias
     mounting : {"3gpp", "silabs", "ublox"}
         Which axes of the local frame are the array's boresight and upper edge.
+    deviations : Deviations, optional
     """
 
     id: str
@@ -60,6 +112,7 @@ class Station:
     field_of_view: float = 6.283185307179586
     bias: StationBias = NO_BIAS
     mounting: Mounting = "3gpp"
+    deviations: Deviations | None = None
 
     def moved(self, by: NDArray[np.float64]) -> "Station":
         """Return the station translated by a vector of shape (3,), m."""
@@ -86,6 +139,11 @@ class SiteInfo:
     max_path_length: float
     stations: tuple[Station, ...]
     document: dict[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def has_deviations(self) -> bool:
+        """Whether a calibration has found the deviations of a station."""
+        return any(station.deviations is not None for station in self.stations)
 
     @cached_property
     def station_by_id(self) -> Mapping[str, Station]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_tables.disk.calibrated import read_calibration
 from rayfix_tables.disk.files import open_table_file
 from rayfix_tables.disk.layout import FileLayout, damage_reported, read_layout
 from rayfix_tables.disk.schema import (
@@ -109,13 +110,15 @@ class Table:
         parts: dict[str, StationPart] = {}
         for station_id in station_ids:
             attributes = layout.attributes[f"stations/{station_id}"]
+            angles, deviations = read_calibration(attributes)
             station = Station(
                 id=station_id,
                 position=_triple(attributes["position_m"]),
                 orientation=_radians(_triple(attributes["orientation_deg"])),
                 field_of_view=float(np.deg2rad(_finite(attributes["field_of_view_deg"]))),
-                bias=read_bias(attributes),
+                bias=replace(read_bias(attributes), angles=angles),
                 mounting=read_mounting(attributes),
+                deviations=deviations,
             ).moved(scene.origin)
             levels = tuple(_read_level(path, layout, mapped) for path in _level_paths(layout, station_id))
             stations.append(station)

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_tables.disk.calibrated import CALIBRATION, calibration_text
 from rayfix_tables.disk.files import has_signature, why_not_regular
 from rayfix_tables.disk.ownership import own_file, remove_abandoned, try_lock
 from rayfix_tables.disk.schema import (
@@ -222,6 +223,9 @@ def _write_part(file: h5py.File, part: StationPart, origin: NDArray[np.float64])
         write_text(group, "mounting", station.mounting)
     for name, value in bias_attributes(station.bias).items():
         group.attrs[name] = value
+    calibration = calibration_text(station)
+    if calibration is not None:
+        write_text(group, CALIBRATION, calibration)
     write_text(group, "part_id", part.part_id)
     group.attrs["lost_ray_share"] = part.lost_ray_share
     group.attrs["coverage"] = np.asarray(part.coverage)

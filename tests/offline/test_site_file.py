@@ -110,19 +110,17 @@ def test_an_unknown_key_of_a_station(site_document: Document) -> None:
     document["stations"].append({"id": "bs2", "position_m": [1, 1, 1], "positon_m": [1, 1, 1]})
     expected = (
         "id, position_m, mounting, boresight_azimuth_deg, boresight_downtilt_deg, roll_deg, orientation_deg, "
-        "field_of_view_deg, bias"
+        "field_of_view_deg, bias, deviations"
     )
     assert refused(document) == f"unknown key stations[1].positon_m; [stations] knows {expected}"
 
 
 def test_an_unknown_section(site_document: Document) -> None:
     message = refused({**site_document(), "colours": {}})
-    assert message == "unknown key colours; the file knows site, propagation, table, stations"
+    assert message == "unknown key colours; the file knows site, room, propagation, table, stations"
 
 
-@pytest.mark.parametrize(
-    ("section", "key"), [("site", "name"), ("site", "scene"), ("stations", "id"), ("stations", "position_m")]
-)
+@pytest.mark.parametrize(("section", "key"), [("site", "name"), ("stations", "id"), ("stations", "position_m")])
 def test_a_missing_key(site_document: Document, section: str, key: str) -> None:
     document = site_document()
     part = document[section]

@@ -49,7 +49,8 @@ def open_site_table(site_path: Path, table_path: Path | None, folder: Path, *, j
         )
     if prepare_twin(site, site_path.parent).scene.sha256 != table.scene.sha256:
         raise TableError(
-            f"{table_path} was built from another version of {site.site.scene}; build it again, or leave out --table"
+            f"{table_path} was built from another version of {site.site.scene or 'its room'}; build it again, or leave "
+            "out --table"
         )
     return table_path
 
@@ -84,7 +85,8 @@ def build_variants(
 
 def _variant(site: SiteFile, site_path: Path, name: str, coarse: bool) -> dict[str, Any]:
     document = site.model_dump(mode="json", exclude_none=True)  # TOML has no null
-    document["site"]["scene"] = str((site_path.parent / site.site.scene).resolve())
+    if site.site.scene is not None:
+        document["site"]["scene"] = str((site_path.parent / site.site.scene).resolve())
     finest, *wider = site.table.windows_deg
     if coarse:
         finest = min(_COARSE * finest, 30.0)

@@ -155,6 +155,18 @@ def load_scene(path: str | Path, *, unit: str = "m", up: str = "z") -> Scene:
     return scene
 
 
+def scene_of(source: Path, objects: list[Placed]) -> Scene:
+    """Make the scene of objects in metres whose z axis points up.
+
+    Parameters
+    ----------
+    source : Path
+        Where they come from, for messages.
+    objects : list of Placed
+    """
+    return _gather(source, objects, Contents(objects=tuple(objects), metres=1.0, up="z"), scale=1.0, up="z")
+
+
 def _refuse_far(path: Path, objects: list[Placed], scale: float) -> None:
     """Refuse coordinates that are too large for a building: their squares and numbers of voxels overflow."""
     for each in objects:

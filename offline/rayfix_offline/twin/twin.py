@@ -1,14 +1,15 @@
 """The digital twin: scene, mirror planes, ray engine and free space, checked against the site."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.scene.engine import FAR, EmbreeEngine, RayEngine
+from rayfix_offline.scene.room import room_scene, wall_remarks
 from rayfix_offline.scene.scene import Scene, load_scene
-from rayfix_offline.site import SiteFile
+from rayfix_offline.site import OFF_WALL, SiteFile
 from rayfix_offline.twin.cleaning import find_duplicates
 from rayfix_offline.twin.enclosures import find_enclosures
 from rayfix_offline.twin.findings import (
@@ -70,6 +71,13 @@ def prepare_twin(site: SiteFile, folder: Path, settings: TwinSettings | None = N
     SceneError
         When the scene cannot be read. Problems of a readable scene are in the twin's findings.
     """
+    if site.room is not None:
+        scene = room_scene(site.room)
+        settings = settings or TwinSettings()
+        # Stations on walls are a millimetre off them, which elsewhere counts as touching.
+        settings = replace(settings, touch=min(settings.touch, 0.5 * OFF_WALL))
+        return prepare_scene(site, replace(scene, remarks=wall_remarks(site)), settings)
+    assert site.site.scene is not None
     scene = load_scene(folder / site.site.scene, unit=site.site.scene_unit, up=site.site.scene_up)
     return prepare_scene(site, scene, settings)
 

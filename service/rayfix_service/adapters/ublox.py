@@ -16,7 +16,8 @@ from rayfix_tables.geometry.angles import wrap_one
 from rayfix_tables.validation.limits import Limits, check_limits
 from rayfix_tables.validation.problems import Path, shown
 
-_PREFIX = "+UUDF:"
+PREFIX = "+UUDF:"
+"""What an event begins with."""
 
 _TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d{1,9})?(?:Z|[+-]\d\d:?\d\d)?")
 """Time that a log writes before an event: ISO 8601, UTC unless it has a time zone."""
@@ -118,10 +119,10 @@ def parse_uudf(line: str) -> UudfEvent:
         For anything else.
     """
     text = line.strip()
-    if not text.startswith(_PREFIX):
-        raise _invalid(f"is {shown(text)}; give a line that begins with {_PREFIX}")
+    if not text.startswith(PREFIX):
+        raise _invalid(f"is {shown(text)}; give a line that begins with {PREFIX}")
     try:
-        fields = next(csv.reader([text.removeprefix(_PREFIX)], skipinitialspace=True))
+        fields = next(csv.reader([text.removeprefix(PREFIX)], skipinitialspace=True))
     except csv.Error as error:
         raise _invalid(f"cannot be split into fields ({error}); give it as the anchor wrote it") from None
     if len(fields) not in (9, 10):
@@ -208,7 +209,7 @@ def parse_ublox(
     faulty: list[FieldProblem] = []
     latest: dict[str, int] = {}
     for number, line in enumerate(text.splitlines()):
-        place = line.find(_PREFIX)
+        place = line.find(PREFIX)
         if place < 0:
             if line.strip():
                 others.append(number)
@@ -220,14 +221,14 @@ def parse_ublox(
             faulty.append(FieldProblem(path=("lines", number), message=message))
             continue
         latest[event.anchor] = event.timestamp_ms
-        found = _Line(number=number, event=event, logged=_logged(line[:place]))
+        found = _Line(number=number, event=event, logged=logged_time(line[:place]))
         joined += joiner.add(event.tag, event.anchor, event.sequence, found, 0.0)
         if len(joined) + len(joiner) > MAX_REPORTS:
             text = f"the lines are more than {MAX_REPORTS} reports; give at most {MAX_REPORTS} at once"
             raise InvalidReportError((FieldProblem(path=(), message=text),))
     joined += joiner.flush()
     if not joined:
-        empty = FieldProblem(path=(), message=f"no line holds {_PREFIX}; give at least one")
+        empty = FieldProblem(path=(), message=f"no line holds {PREFIX}; give at least one")
         raise InvalidReportError(tuple(faulty[:_LISTED]) or (empty,), max(0, len(faulty) - _LISTED))
     joined.sort(key=lambda transmission: min(line.number for line in transmission.heard.values()))
     reports: list[Adapted] = []
@@ -243,7 +244,7 @@ def parse_ublox(
     return tuple(reports)
 
 
-def _logged(before: str) -> datetime | None:
+def logged_time(before: str) -> datetime | None:
     """Read the time that a log writes before an event; of several, the last one."""
     found = _TIME.findall(before)
     if not found:
@@ -295,7 +296,7 @@ def _without_event(lines: Sequence[int]) -> list[Skipped]:
         return []
     more = len(lines) - 1
     others = f" and {more} more {'line holds' if more == 1 else 'lines hold'}" if more else " holds"
-    return [Skipped(path=("lines", lines[0]), reason=f"this line{others} no {_PREFIX}")]
+    return [Skipped(path=("lines", lines[0]), reason=f"this line{others} no {PREFIX}")]
 
 
 def _invalid(text: str) -> InvalidReportError:

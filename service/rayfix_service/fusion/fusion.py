@@ -1,5 +1,6 @@
 """Fuse the measurements of a report: the product of their likelihoods and of the prior."""
 
+from rayfix_service.fusion.measurements.calibrated import with_deviations
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fixes import Product
@@ -64,6 +65,7 @@ class Fusion:
 
         The estimate separates quick fixes from slow ones; it is infinite for a report that is slow in any case.
         """
+        report = with_deviations(report, self.table.site)
         seconds = self._quadrature.seconds(report) if len(report.measurements) <= _MOST_MEASUREMENTS else None
         return self._cost.seconds(report) if seconds is None else seconds
 
@@ -85,7 +87,8 @@ class Fusion:
         FixStoppedError
             When it was stopped.
         """
-        sorted_report = sort_report(report, site or self.table.site)
+        site = site or self.table.site
+        sorted_report = sort_report(with_deviations(report, site), site)
         prior = self._prior(report)
         if self._quadrature.suits(sorted_report):
             return self._integrated(sorted_report, prior, stop)

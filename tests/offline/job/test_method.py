@@ -62,6 +62,8 @@ SAME_BITS = "changes memory or time only, no bit of the table"
 WAITING = "how long something is waited for"
 
 NOT_IN_IDENTITY = {
+    "offline.scene.room._SIDES": "shapes the scene, which has a hash of its own",
+    "offline.scene.room.wall_remarks": "only words a remark",
     "offline.job.cluster.LOOK_SECONDS": WAITING,
     "offline.job.cluster_workers.ANSWER_SECONDS": WAITING,
     "offline.job.cluster_workers.LEFT_SECONDS": WAITING,

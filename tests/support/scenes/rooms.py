@@ -60,6 +60,7 @@ def room_with_crate(height: float = 1.0) -> trimesh.Trimesh:
 
 def finest_level(folder: Path, scene: trimesh.Scene, site: SiteFile) -> LevelRays:
     """Write a scene where the site looks for it, and trace the site's first station."""
+    assert site.site.scene is not None
     (folder / site.site.scene).write_bytes(scene.export(file_type="glb"))
     return trace_station(site.stations[0], site, prepare_twin(site, folder)).finest
 

@@ -48,6 +48,32 @@ def angle_residual(angle: Angle, station: Station, north: float, position: Vecto
     return math.atan2(cross, x * u + y * v + z * w)
 
 
+def signed_angle_residual(
+    angle: Angle, station: Station, north: float, position: Vector
+) -> tuple[float, float | None] | None:
+    """Difference of a measured direction and the straight one, as azimuth and zenith of the measurement's frame.
+
+    The station's bias is taken off.
+
+    Parameters
+    ----------
+    angle, station, north, position
+        As of :func:`angle_residual`.
+
+    Returns
+    -------
+    tuple of (float, float or None), rad, or None
+        The second is None of an azimuth alone; None for a position above, below or at the station.
+    """
+    measured = without_bias(angle, station)
+    x, y, z = _in_frame(angle.frame, station, north, _difference(position, station.position))
+    if x == y == 0.0:
+        return None
+    azimuth = math.remainder(measured.azimuth - math.atan2(y, x), 2.0 * math.pi)
+    zenith = None if measured.zenith is None else measured.zenith - math.atan2(math.hypot(x, y), z)
+    return azimuth, zenith
+
+
 def range_residual(measured: Range, station: Station, position: Vector) -> float:
     """Difference, m, of a measured path length and the distance from the station to a position, without its sign.
 

@@ -1,11 +1,13 @@
 """Angles as measured, turned into directions of the scene."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_service.fusion.measurements.calibrated import local_bias
 from rayfix_service.fusion.measurements.report import Angle
 from rayfix_tables.geometry.angles import angles_of, direction, local_to_scene
 from rayfix_tables.geometry.mounting import board_to_scene
@@ -65,13 +67,21 @@ def without_bias(angle: Angle, station: Station) -> Angle:
     if bias == NO_BIAS:
         return angle
     azimuth, zenith, zenith_stdev = angle.azimuth - bias.azimuth, angle.zenith, angle.zenith_stdev
-    azimuth_stdev = float(np.hypot(angle.azimuth_stdev, bias.angle_stdev))
-    correlation = angle.correlation
+    azimuth_stdev, correlation, local = angle.azimuth_stdev, angle.correlation, None
+    if bias.angles is not None:
+        local = local_bias(bias.angles, azimuth, 0.5 * np.pi if zenith is None else zenith - bias.zenith)
+        azimuth -= local.azimuth
+        azimuth_stdev = math.hypot(azimuth_stdev, local.azimuth_stdev) / local.azimuth_slope
+    azimuth_stdev = math.hypot(azimuth_stdev, bias.angle_stdev)
     if zenith is not None and zenith_stdev is not None:
         zenith -= bias.zenith
-        widened = float(np.hypot(zenith_stdev, bias.angle_stdev))
-        correlation *= angle.azimuth_stdev * zenith_stdev / (azimuth_stdev * widened)
-        zenith_stdev = widened
+        covariance = correlation * angle.azimuth_stdev * zenith_stdev
+        if local is not None:
+            zenith -= local.zenith
+            covariance /= local.azimuth_slope * local.zenith_slope
+            zenith_stdev = math.hypot(zenith_stdev, local.zenith_stdev) / local.zenith_slope
+        zenith_stdev = math.hypot(zenith_stdev, bias.angle_stdev)
+        correlation = covariance / (azimuth_stdev * zenith_stdev)
         if not 0.0 <= zenith <= np.pi:
             # Beyond a pole lies the other side.
             zenith = float(np.arccos(np.cos(zenith)))

@@ -6,6 +6,7 @@ Where the best candidate is less probable than p, the region reaches to its riva
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -95,6 +96,11 @@ class CredibleRegions:
     def horizontal_radius(self, probability: float) -> float:
         """Radius, m, of the horizontal circle that holds the UE with a probability."""
         return self.accuracies(probability).horizontal_radius
+
+    def horizontal_radii(self, probabilities: Sequence[float]) -> list[float]:
+        """Radii, m, of the horizontal circles of several probabilities, in one go."""
+        apart = np.sort(np.hypot(*(self.points.places() - self.position).T[:2]))
+        return [float(apart[_rank(self._held(p), len(apart))]) for p in probabilities]
 
     def vertical_half_height(self, probability: float) -> float:
         """Half the height, m, of the layer that holds the UE with a probability."""

@@ -1,0 +1,1 @@
+"""Calibration of stations from recorded reports."""

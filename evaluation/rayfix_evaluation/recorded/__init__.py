@@ -1,0 +1,1 @@
+"""Recorded fixes beside the truth."""
