@@ -76,11 +76,14 @@ def draw_pictures(bench: Bench, heard: Sequence[int], seed: int) -> dict[str, An
         flat = fit_mixture(crossings, settings.num_components, int(rng.integers(2**31))) if len(crossings) > 1 else None
         if flat is not None:
             plane.append(flat)
+        path = drop.paths[station.id]
         stations.append(
             {
                 "id": station.id,
-                "path": _rounded(drop.paths[station.id].vertices[0]),
-                "bounces": int(drop.paths[station.id].num_reflections[0]),
+                "path": _rounded(path.vertices[0]),
+                "bounces": int(path.num_reflections[0]),
+                "walls": int(path.num_walls[0]),
+                "crossings": _rounded(path.crossings[0, : int(path.num_walls[0])]),
                 "measured_length": round(length, 4),
                 "rays": [_rounded(corners) for corners in _polylines(launcher, origin, measured, rng)],
                 "points_aoa": _rounded(_some(points.position, _POINTS, rng)),
@@ -106,7 +109,7 @@ def draw_pictures(bench: Bench, heard: Sequence[int], seed: int) -> dict[str, An
 def _choose(bench: Bench, heard: Sequence[int]) -> int:
     def merit(number: int) -> tuple[int, int]:
         paths = bench.drop(World(), number).paths.values()
-        direct = sum(int(p.num_reflections[0] == 0) for p in paths)
+        direct = sum(int(p.line_of_sight[0]) for p in paths)
         return len(paths), -direct if direct else -len(paths)
 
     return max(heard[:_LOOKED_AT], key=merit)

@@ -14,7 +14,8 @@ from trimesh.visual.material import PBRMaterial
 
 from rayfix_evaluation.drops.accuracy import solver_of
 from rayfix_evaluation.truth.forward import ForwardSolver
-from rayfix_evaluation.truth.fresnel import reflection_gain_db
+from rayfix_evaluation.truth.fresnel import half_space
+from rayfix_evaluation.truth.walls import Walls
 from rayfix_offline.build import build_table
 from rayfix_offline.rays.segments import Segments
 from rayfix_offline.rays.trace import reflectivity_of
@@ -161,8 +162,8 @@ def test_energy(cosine: float, permittivity: complex) -> None:
 @given(cosine=st.floats(1e-3, 1.0), permittivity=permittivities)
 def test_the_forward_solver_has_the_same_physics(cosine: float, permittivity: complex) -> None:
     """Two formulas that share no code; where next to nothing is reflected, what is left is rounding."""
-    theirs = 10.0 ** (reflection_gain_db(np.array([cosine]), np.array([permittivity])) / 10.0)
-    assert theirs[0] == pytest.approx(float(fresnel_power(cosine, permittivity)), rel=1e-6, abs=1e-9)
+    theirs = (np.abs(half_space(np.array([cosine]), np.array([permittivity]))) ** 2).mean()
+    assert theirs == pytest.approx(float(fresnel_power(cosine, permittivity)), rel=1e-6, abs=1e-9)
 
 
 def test_arrays_broadcast() -> None:
@@ -224,7 +225,7 @@ def test_paths_of_launcher_and_solver_are_alike(launch_in: Launch, clutter: NDAr
         np.arange(108).reshape(-1, 3),
         max_reflections=2,
         reflection_loss_db=4.0,
-        face_permittivity=reflectivity.permittivity,
+        walls=Walls.opaque(reflectivity.permittivity, carrier_ghz=3.5),
     )
     station = np.array([3.6, 0.4, 2.6])
     paths = solver.paths(station, np.array([2.1, 2.4, 1.3]))
@@ -244,8 +245,9 @@ def test_paths_of_launcher_and_solver_are_alike(launch_in: Launch, clutter: NDAr
 
 
 def test_the_solver_wants_one_permittivity_for_each_face() -> None:
-    with pytest.raises(ValueError, match="one value for each of the 4 faces"):
-        ForwardSolver.from_mesh(corridor().reshape(-1, 3), np.arange(12).reshape(-1, 3), face_permittivity=[2.0])
+    walls = Walls.opaque(np.array([2.0 + 0j]), carrier_ghz=3.5)
+    with pytest.raises(ValueError, match="the walls have 1 faces and the mesh 4"):
+        ForwardSolver.from_mesh(corridor().reshape(-1, 3), np.arange(12).reshape(-1, 3), walls=walls)
 
 
 # Sites
@@ -304,9 +306,11 @@ def test_the_solver_of_a_table_has_its_materials(
         build_table(path, tmp_path / f"{reflection}.h5")
         tables[reflection] = Table.open(tmp_path / f"{reflection}.h5")
         solvers[reflection] = solver_of(tables[reflection])
-    assert solvers["constant"].triangle_permittivity is None
-    permittivity = solvers["itu"].triangle_permittivity
-    assert permittivity is not None
+    assert solvers["constant"].walls is None
+    walls = solvers["itu"].walls
+    assert walls is not None
+    assert not walls.lets_through.any()
+    permittivity = walls.permittivity
     materials = {known("brick", 3.5): 12, known("metal", 3.5): 12}
     assert {value: int(np.sum(permittivity == value)) for value in materials} == materials
     assert np.isnan(permittivity).sum() == 12
