@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from rayfix_offline.scene.materials import ITU_MATERIALS, itu_name
 from rayfix_tables.errors import SiteError
 from rayfix_tables.geometry.mounting import Boresight, boresight_of, orientation_of
 from rayfix_tables.site import Mounting, SiteInfo, Station, StationBias
@@ -92,6 +93,16 @@ class PropagationSection(_Section):
         description="loss of each reflection; with itu, for materials without a known name",
         json_schema_extra={"effect": "time and size stay the same"},
     )
+    transmission: bool = Field(
+        default=True,
+        description="whether walls of known material and thickness let signals through",
+        json_schema_extra={"effect": "time and size grow where walls let signals through: see Walls"},
+    )
+    excess_length: bool = Field(
+        default=True,
+        description="whether a wall that a path passes adds to its measured length, as a slab of its permittivity does",
+        json_schema_extra={"effect": "time and size stay the same"},
+    )
     path_prior: Literal["power", "uniform", "paper"] = Field(
         default="power",
         description="path-selection prior: strong paths preferred, any path alike, or as in the paper",
@@ -104,6 +115,46 @@ class PropagationSection(_Section):
         description="exponent of the path gain in the path-selection prior; a larger one prefers strong paths more",
         json_schema_extra={"effect": "time and size stay the same"},
     )
+
+
+class MaterialSection(_Section):
+    """``[materials.NAME]``: a material of the scene, by the name that the scene file gives it."""
+
+    itu: str | None = Field(
+        default=None,
+        description="material of ITU-R P.2040, e.g. plasterboard; NAME itself unless given",
+    )
+    permittivity: Annotated[float, Field(ge=1, le=1000)] | None = Field(
+        default=None, description="real part of the relative permittivity, instead of itu"
+    )
+    conductivity_s_m: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
+        default=None, description="conductivity in S/m, with permittivity; 0 unless given"
+    )
+    reflection_loss_db: Annotated[float, Field(ge=0, le=200)] | None = Field(
+        default=None, description="loss of each reflection, instead of the computed one"
+    )
+    transmission_loss_db: Annotated[float, Field(ge=0, le=200)] | None = Field(
+        default=None, description="loss of each passage through a wall, instead of the computed one"
+    )
+    thickness_m: Annotated[float, Field(gt=0, le=100)] | None = Field(
+        default=None,
+        description="thickness of sheets; a closed solid has its own, but lets signals through only with this key",
+        json_schema_extra={"effect": "time and size grow where walls let signals through: see Walls"},
+    )
+
+    @model_validator(mode="after")
+    def _made_of_one(self) -> "MaterialSection":
+        if self.itu is not None and itu_name(self.itu) is None:
+            raise ValueError(f"itu = '{self.itu}' is not in ITU-R P.2040, which has {', '.join(ITU_MATERIALS)}")
+        if self.itu is not None and self.permittivity is not None:
+            raise ValueError("itu and permittivity both state the material; give one of them")
+        if self.conductivity_s_m is not None and self.permittivity is None:
+            raise ValueError("conductivity_s_m needs permittivity; add it, or give itu instead")
+        return self
+
+    def known(self, name: str) -> bool:
+        """Whether a material of this name has a permittivity."""
+        return self.permittivity is not None or itu_name(self.itu or name) is not None
 
 
 class TableSection(_Section):
@@ -263,6 +314,7 @@ class SiteFile(_Section):
     site: SiteSection
     propagation: PropagationSection = PropagationSection()
     table: TableSection = TableSection()
+    materials: dict[Annotated[str, Field(min_length=1)], MaterialSection] = {}
     stations: tuple[StationSection, ...]
 
     @model_validator(mode="after")
@@ -273,6 +325,16 @@ class SiteFile(_Section):
         twice = sorted({i for i in ids if ids.count(i) > 1})
         if twice:
             raise ValueError(f"station ids must differ; more than one station is called {', '.join(twice)}")
+        return self
+
+    @model_validator(mode="after")
+    def _thick_ones_known(self) -> "SiteFile":
+        for name, material in self.materials.items():
+            if material.thickness_m is not None and material.transmission_loss_db is None and not material.known(name):
+                raise ValueError(
+                    f"materials.{name} has a thickness but no permittivity; add itu, permittivity or "
+                    "transmission_loss_db"
+                )
         return self
 
     def moved(self, by: NDArray[np.float64]) -> "SiteFile":
@@ -376,6 +438,7 @@ def _known_keys(location: tuple[str | int, ...]) -> list[str]:
         "site": SiteSection,
         "propagation": PropagationSection,
         "table": TableSection,
+        "materials": MaterialSection,
         "stations": StationSection,
         "bias": BiasSection,
     }

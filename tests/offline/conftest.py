@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from rayfix_offline.rays.launch import launch
 from rayfix_offline.rays.segments import Segments
 from rayfix_offline.scene.engine import EmbreeEngine
-from rayfix_offline.scene.materials import Reflectivity, constant_reflectivity
+from rayfix_offline.scene.walls import Walls, opaque_walls
 from rayfix_offline.twin.planes import merge_coplanar
 from tests.support.scenes.rooms import CABINET, ROOM, TABLE, scene_of_boxes
 from tests.support.scenes.shapes import box
@@ -42,7 +42,7 @@ def launch_in() -> Callable[..., Segments]:
         max_reflections: int = 3,
         max_path_length: float = 1000.0,
         loss_db: float = 6.0,
-        reflectivity: Reflectivity | None = None,
+        walls: Walls | None = None,
     ) -> Segments:
         corners = triangles.reshape(-1, 3)
         return launch(
@@ -50,7 +50,7 @@ def launch_in() -> Callable[..., Segments]:
             directions,
             engine=EmbreeEngine(triangles),
             planes=merge_coplanar(triangles),
-            reflectivity=reflectivity or constant_reflectivity(len(triangles), loss_db=loss_db),
+            walls=walls or opaque_walls(len(triangles), loss_db=loss_db),
             bounds=np.stack([corners.min(axis=0), corners.max(axis=0)]),
             max_reflections=max_reflections,
             max_path_length=max_path_length,

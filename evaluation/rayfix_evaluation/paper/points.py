@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rayfix_offline.rays.launch import launch
 from rayfix_offline.rays.segments import Segments
 from rayfix_offline.scene.engine import EmbreeEngine, RayEngine
-from rayfix_offline.scene.materials import Reflectivity, constant_reflectivity
+from rayfix_offline.scene.walls import Walls, opaque_walls
 from rayfix_offline.twin.planes import Planes, merge_coplanar
 from rayfix_service.fusion.measurements.directions import Direction
 from rayfix_tables.geometry.angles import direction
@@ -55,7 +55,7 @@ class Launcher:
 
     engine: RayEngine
     planes: Planes
-    reflectivity: Reflectivity
+    walls: Walls
     bounds: NDArray[np.float64]
     max_reflections: int
     max_path_length: float
@@ -70,7 +70,7 @@ class Launcher:
             engine=EmbreeEngine(triangles),
             planes=merge_coplanar(triangles),
             # The paper's points have no power.
-            reflectivity=constant_reflectivity(len(triangles), loss_db=0.0),
+            walls=opaque_walls(len(triangles), loss_db=0.0),
             bounds=np.stack([corners.min(axis=0), corners.max(axis=0)]),
             max_reflections=int(propagation["max_reflections"]),
             max_path_length=float(propagation["max_path_length_m"]),
@@ -83,7 +83,7 @@ class Launcher:
             directions,
             engine=self.engine,
             planes=self.planes,
-            reflectivity=self.reflectivity,
+            walls=self.walls,
             bounds=self.bounds,
             max_reflections=self.max_reflections,
             max_path_length=self.max_path_length,

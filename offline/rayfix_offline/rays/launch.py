@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rayfix_offline.rays.segments import Segments, Sequences
 from rayfix_offline.rays.settings import RaySettings
 from rayfix_offline.scene.engine import RayEngine
-from rayfix_offline.scene.materials import Reflectivity
+from rayfix_offline.scene.walls import Walls
 from rayfix_offline.twin.planes import Planes
 
 
@@ -24,7 +24,7 @@ def launch(
     *,
     engine: RayEngine,
     planes: Planes,
-    reflectivity: Reflectivity,
+    walls: Walls,
     bounds: NDArray[np.float64],
     max_reflections: int,
     max_path_length: float,
@@ -37,7 +37,7 @@ def launch(
     station : ndarray of shape (3,), m
     directions : ndarray of shape (n_rays, 3)
         Unit vectors.
-    reflectivity : Reflectivity
+    walls : Walls
         Of the engine's triangles.
     bounds : ndarray of shape (2, 3), m
         Low and high corner of the scene; a ray that hits no triangle ends there.
@@ -90,7 +90,7 @@ def launch(
         first += len(generations[-1].parents)
         generations.append(children.shortened(num_children))
         rays, origins, headings = rays[:num_on], origins[:num_on], headings[:num_on]
-        loss = reflectivity.log_gain(faces[:num_on], front.cosines[:num_on])
+        loss = walls.reflected(faces[:num_on], front.cosines[:num_on])
         log_gain[rays, depth + 1] = log_gain[rays, depth] + loss
     return Segments(
         sequence=sequence,

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.rays.launch import launch
 from rayfix_offline.rays.rays import sample_rays
-from rayfix_offline.scene.materials import constant_reflectivity
+from rayfix_offline.scene.walls import opaque_walls
 from rayfix_offline.site import StationSection
 from rayfix_offline.twin.twin import Twin
 
@@ -75,7 +75,7 @@ def find_escapes(station: StationSection, twin: Twin, *, max_reflections: int) -
         rays.directions,
         engine=twin.engine,
         planes=twin.planes,
-        reflectivity=constant_reflectivity(len(twin.scene.faces), loss_db=0.0),
+        walls=opaque_walls(len(twin.scene.faces), loss_db=0.0),
         bounds=twin.scene.bounds,
         max_reflections=depth,
         max_path_length=ENDLESS,

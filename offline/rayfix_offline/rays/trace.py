@@ -13,7 +13,8 @@ from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments, Sequences
 from rayfix_offline.rays.settings import RaySettings
 from rayfix_offline.rays.surface_sequences import surface_sequences
-from rayfix_offline.scene.materials import ReflectionSettings, Reflectivity, constant_reflectivity, itu_reflectivity
+from rayfix_offline.scene.materials import ReflectionSettings
+from rayfix_offline.scene.walls import Walls, walls_of
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin.twin import Twin
 from rayfix_tables.grid import AngularGrid
@@ -77,18 +78,9 @@ def prior_spacing(twin: Twin, settings: RaySettings | None = None) -> float:
     return max(settings.prior_spacing, wanted)
 
 
-def reflectivity_of(site: SiteFile, twin: Twin, settings: ReflectionSettings | None = None) -> Reflectivity:
-    """Return the reflectivity of the triangles of a site's scene."""
-    propagation, scene = site.propagation, twin.scene
-    if propagation.reflection == "constant":
-        return constant_reflectivity(len(scene.faces), loss_db=propagation.reflection_loss_db)
-    return itu_reflectivity(
-        scene.face_materials,
-        scene.materials,
-        carrier_ghz=propagation.carrier_ghz,
-        loss_db=propagation.reflection_loss_db,
-        settings=settings,
-    )
+def scene_walls(site: SiteFile, twin: Twin, settings: ReflectionSettings | None = None) -> Walls:
+    """Return what the triangles of a site's scene reflect and let through."""
+    return walls_of(site, twin.scene, twin.solid, twin.outward, settings)
 
 
 def trace_station(
@@ -115,7 +107,7 @@ def trace_station(
     window = float(np.deg2rad(site.table.windows_deg[0]))
     spacing = window / settings.rays_per_window
     widest = prior_spacing(twin, settings)
-    reflectivity = reflectivity_of(site, twin, reflection)
+    walls = scene_walls(site, twin, reflection)
 
     def launched(spacing: float, *seed: int) -> tuple[RaySet, Segments]:
         return launch_rays(
@@ -124,7 +116,7 @@ def trace_station(
             twin,
             spacing,
             np.random.default_rng([site.table.seed, *seed]),
-            reflectivity=reflectivity,
+            walls=walls,
             mirror_offset=settings.mirror_offset,
         )
 
@@ -169,7 +161,7 @@ def launch_rays(
     spacing: float,
     rng: np.random.Generator,
     *,
-    reflectivity: Reflectivity | None = None,
+    walls: Walls | None = None,
     mirror_offset: float = RaySettings.mirror_offset,
 ) -> tuple[RaySet, Segments]:
     """Launch a station's rays.
@@ -178,7 +170,7 @@ def launch_rays(
     ----------
     spacing : float, rad
         Between neighbouring rays.
-    reflectivity : Reflectivity, optional
+    walls : Walls, optional
         The site's when left out.
     mirror_offset : float
         See :func:`~rayfix_offline.rays.launch.launch`.
@@ -189,7 +181,7 @@ def launch_rays(
         rays.directions,
         engine=twin.engine,
         planes=twin.planes,
-        reflectivity=reflectivity if reflectivity is not None else reflectivity_of(site, twin),
+        walls=walls if walls is not None else scene_walls(site, twin),
         bounds=twin.scene.bounds,
         max_reflections=site.propagation.max_reflections,
         max_path_length=site.propagation.max_path_length_m,

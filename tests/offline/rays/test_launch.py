@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rayfix_offline.rays.launch import launch
 from rayfix_offline.rays.rays import sample_rays
 from rayfix_offline.rays.segments import Segments
-from rayfix_offline.scene.materials import constant_reflectivity
+from rayfix_offline.scene.walls import opaque_walls
 from rayfix_offline.twin.planes import merge_coplanar
 from tests.support.scenes.shapes import quad
 
@@ -263,7 +263,7 @@ def test_a_hit_behind_the_ray_is_a_loss() -> None:
         directions,
         engine=Misled(),
         planes=merge_coplanar(wall),
-        reflectivity=constant_reflectivity(len(wall), loss_db=6.0),
+        walls=opaque_walls(len(wall), loss_db=6.0),
         bounds=np.array([(0, -9, -9), (5, 9, 9)]),
         max_reflections=1,
         max_path_length=100.0,
