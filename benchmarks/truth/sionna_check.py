@@ -1,52 +1,28 @@
 """The forward solver compared with Sionna RT: all paths of some stations to random points, in any scene.
 
-``--office`` compares an office of sheets that let signals through, whose paths pass up to ``--max-walls`` of them.
+``--office`` compares the bundled office, whose sheets let signals through, and paths that pass up to ``--max-walls``.
 Needs the extra ``sionna`` and LLVM; see docs/evaluation.md.
 """
 
 import argparse
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from benchmarks.truth.office import STATIONS, THICKNESS, office_sheets
+from benchmarks.truth.scenes import ComparedScene, example_scene, mesh_scene, site_scene
 from benchmarks.truth.sionna_rt import NOTHING_COMPARED, Physics, compare, shortest_segment, sionna_paths
-from rayfix.example.hall import hall_scene, hall_stations
 from rayfix_evaluation.truth.forward import ForwardSolver
-from rayfix_evaluation.truth.walls import Walls
-from rayfix_offline.scene.materials import complex_permittivity
-from rayfix_offline.scene.scene import load_scene
 
 _NO_LIMIT = 1e4  # m; Sionna RT knows no longest path
 _STATIONS = 4
-_RANGE_DB = 30.0  # paths of an office that are weaker than the strongest by more are not compared
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Compared:
-    """A scene in which paths are compared: its mesh, stations, and materials if signals pass through its sheets."""
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    stations: NDArray[np.float64]
-    materials: tuple[str, ...] | None = None
-
-    def walls(self, carrier_ghz: float) -> Walls | None:
-        """Sheets of the materials; without their excess length, which Sionna RT leaves out."""
-        if self.materials is None:
-            return None
-        known = {name: complex_permittivity(name, carrier_ghz) for name in set(self.materials)}
-        permittivity = np.array([np.nan if known[name] is None else known[name] for name in self.materials])
-        thickness = np.array([np.nan if name == "metal" else THICKNESS[name] for name in self.materials])
-        return replace(Walls.sheets(permittivity, thickness, carrier_ghz=carrier_ghz), excess_length=False)
+_RANGE_DB = 30.0  # where walls let signals through, paths that are weaker than the strongest by more are not compared
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scene", type=Path, help="a scene file; the bundled hall when left out")
-    parser.add_argument("--office", action="store_true", help="an office whose walls let signals through")
+    parser.add_argument("--site", type=Path, help="a site file, with its materials")
+    parser.add_argument("--office", action="store_true", help="the bundled office, whose walls let signals through")
     parser.add_argument("--carrier-ghz", type=float, default=3.5)
     parser.add_argument("--points", type=int, default=10)
     parser.add_argument("--max-reflections", type=int, default=3)
@@ -55,15 +31,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2026)
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
-    scene = chosen_scene(options.scene, office=options.office, rng=rng)
-    points = within(scene.vertices, options.points, rng)
-    passes = scene.materials is not None
+    scene = chosen_scene(options, rng)
+    points = scene.points(options.points, rng)
+    passes = scene.passes
     solver = ForwardSolver.from_mesh(
         scene.vertices,
         scene.faces,
         max_reflections=options.max_reflections,
         max_path_length=_NO_LIMIT,
-        walls=scene.walls(options.carrier_ghz),
+        walls=scene.walls if passes else None,
         polarisation="kept",
     )
     solvers = [solver.station(place) for place in scene.stations]
@@ -73,8 +49,8 @@ def main() -> None:
         scene.stations,
         points,
         max_reflections=options.max_reflections,
-        materials=scene.materials,
-        thickness=THICKNESS if passes else None,
+        materials=scene.materials if passes else None,
+        thickness=scene.thickness,
         physics=Physics(
             carrier_ghz=options.carrier_ghz,
             refraction=passes,
@@ -113,27 +89,13 @@ def main() -> None:
         )
 
 
-def chosen_scene(path: Path | None, *, office: bool, rng: np.random.Generator) -> Compared:
-    """Make the scene of the command line's options: a file, the office, or the bundled hall."""
-    if office:
-        sheets = office_sheets()
-        return Compared(vertices=sheets.vertices, faces=sheets.faces, stations=STATIONS, materials=sheets.materials)
-    if path is not None:
-        scene = load_scene(path)
-        stations = within(scene.vertices, _STATIONS, rng)
-        return Compared(vertices=scene.vertices, faces=scene.faces.astype(np.int64), stations=stations)
-    mesh = hall_scene().to_geometry()
-    return Compared(
-        vertices=np.asarray(mesh.vertices, np.float64),
-        faces=np.asarray(mesh.faces, np.int64),
-        stations=np.array([place for _, place in hall_stations()]),
-    )
-
-
-def within(vertices: NDArray[np.float64], count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Points drawn evenly from the box of a scene, which may lie within solids: there are then no paths."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return rng.uniform(low + 0.05 * (high - low), high - 0.05 * (high - low), (count, 3))
+def chosen_scene(options: argparse.Namespace, rng: np.random.Generator) -> ComparedScene:
+    """Make the scene of the command line's options."""
+    if options.scene is not None:
+        return mesh_scene(options.scene, _STATIONS, rng)
+    if options.site is not None:
+        return site_scene(options.site, carrier_ghz=options.carrier_ghz)
+    return example_scene("office" if options.office else "hall", carrier_ghz=options.carrier_ghz)
 
 
 if __name__ == "__main__":
