@@ -18,8 +18,11 @@ from rayfix_tables.table import Table
 
 def walls_of_table(table: Table) -> Walls | None:
     """Return the walls of a table's scene; None if all are opaque and reflect with one loss."""
+    document = table.site.document
+    if document["propagation"].get("reflection", "constant") == "constant" and not document.get("materials"):
+        return None  # also of tables whose software knew no materials
     stored = table.scene.in_table_frame
-    site = parse_site(table.site.document).moved(-table.scene.origin)
+    site = parse_site(document).moved(-table.scene.origin)
     count = len(stored.faces)
     scene = Scene(
         vertices=np.array(stored.vertices),
@@ -34,8 +37,6 @@ def walls_of_table(table: Table) -> Walls | None:
     if found.passable.any():
         # Only now does it matter which of them enclose solids.
         return walls_of_twin(prepare_scene(site, scene))
-    if (found.reflection_loss_db == site.propagation.reflection_loss_db).all():
-        return None
     return _walls(found)
 
 
