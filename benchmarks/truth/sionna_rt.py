@@ -106,6 +106,7 @@ def sionna_paths(
     physics: Physics | None = None,
     samples: int = 1_000_000,
     seed: int = 1,
+    from_stations: bool = False,
 ) -> list[list[FoundPaths]]:
     """Find the paths of stations to points with Sionna RT.
 
@@ -123,6 +124,8 @@ def sionna_paths(
     physics : Physics, optional
     samples : int
         Rays that are shot from each point.
+    from_stations : bool
+        Whether they are shot from each station instead, which is faster with many points.
 
     Returns
     -------
@@ -147,13 +150,14 @@ def sionna_paths(
         scene = rt.load_scene(str(Path(folder) / "scene.xml"), merge_shapes=False)
     scene.frequency = physics.carrier_ghz * 1e9
     scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="VH")
-    for n, place in enumerate(stations.tolist()):
-        scene.add(rt.Receiver(name=f"station-{n}", position=place))
+    sources, targets = (stations, points) if from_stations else (points, stations)
+    for n, place in enumerate(targets.tolist()):
+        scene.add(rt.Receiver(name=f"target-{n}", position=place))
     solver = rt.PathSolver()
     found = []
-    # One point at a time, which bounds the memory.
-    for place in points.tolist():
-        scene.add(rt.Transmitter(name="point", position=place))
+    # One source at a time, which bounds the memory.
+    for place in sources.tolist():
+        scene.add(rt.Transmitter(name="source", position=place))
         paths = solver(
             scene=scene,
             max_depth=physics.max_interactions or max_reflections,
@@ -167,13 +171,15 @@ def sionna_paths(
             samples_per_src=samples,
             seed=seed,
         )
-        found.append(_by_station(paths, physics, max_reflections))
-        scene.remove("point")
-    return found
+        end = (paths.phi_t, paths.theta_t) if from_stations else (paths.phi_r, paths.theta_r)
+        towards = direction(*(np.array(angle, np.float64)[:, 0] for angle in end))
+        found.append(_by_target(paths, towards, physics, max_reflections))
+        scene.remove("source")
+    return [list(by_station) for by_station in zip(*found, strict=True)] if from_stations else found
 
 
-def _by_station(paths: Any, physics: Physics, max_reflections: int) -> list[FoundPaths]:
-    """Paths of the only transmitter to each receiver."""
+def _by_target(paths: Any, towards: Array, physics: Physics, max_reflections: int) -> list[FoundPaths]:
+    """Paths of the only transmitter to each receiver; ``towards`` of shape (n_targets, n_paths, 3)."""
     valid = np.array(paths.valid, np.bool_)[:, 0]
     amplitude = np.array(paths.a[0], np.float64) + 1j * np.array(paths.a[1], np.float64)
     # Both polarisations sent, one after the other, and the power of both received.
@@ -181,20 +187,20 @@ def _by_station(paths: Any, physics: Physics, max_reflections: int) -> list[Foun
     unit = SPEED_OF_LIGHT / (physics.carrier_ghz * 1e9) / (4.0 * np.pi)
     kinds = np.array(paths.interactions, np.int64)[:, :, 0]
     length = np.array(paths.tau, np.float64)[:, 0] * SPEED_OF_LIGHT
-    towards = direction(np.array(paths.phi_r, np.float64)[:, 0], np.array(paths.theta_r, np.float64)[:, 0])
     reflections = (kinds == _SPECULAR).sum(axis=0)
+    walls = (kinds == _REFRACTION).sum(axis=0)
     others = ((kinds == _DIFFUSE) | (kinds == _DIFFRACTION)).sum(axis=0)
     kept = valid & (reflections + others <= max_reflections) & (power > 0.0)
     return [
         FoundPaths(
-            path_length=length[s, kept[s]],
-            direction=towards[s, kept[s]],
-            gain_db=10.0 * np.log10(power[s, kept[s]] / unit**2),
-            num_reflections=reflections[s, kept[s]],
-            num_walls=(kinds[:, s] == _REFRACTION).sum(axis=0)[kept[s]],
-            others=others[s, kept[s]],
+            path_length=length[n, kept[n]],
+            direction=towards[n, kept[n]],
+            gain_db=10.0 * np.log10(power[n, kept[n]] / unit**2),
+            num_reflections=reflections[n, kept[n]],
+            num_walls=walls[n, kept[n]],
+            others=others[n, kept[n]],
         )
-        for s in range(len(valid))
+        for n in range(len(valid))
     ]
 
 
