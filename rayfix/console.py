@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from rayfix_offline.check import Check
 
 
+MOST_WALLS = 4
+"""Columns of the summary of a build for numbers of walls."""
+
+
 def print_evaluation(results: Mapping[str, Any], page: Path) -> None:
     """Print the main results of an evaluation and the path of its report."""
     grid = Grid(title=f"{results['site']}: error of the position, m", title_justify="left", box=box.SIMPLE_HEAD)
@@ -72,8 +76,12 @@ def print_build_summary(summary: "BuildSummary") -> None:
     )
     for heading in ("", "cells", "filled", "tubes", "MB", "lost"):
         grid.add_column(heading, justify="right")
-    for k in range(max(len(s.coverage) for s in summary.stations)):
+    most_reflections = max(len(s.coverage) for s in summary.stations)
+    most_walls = min(MOST_WALLS, max(len(s.wall_coverage) for s in summary.stations))
+    for k in range(most_reflections):
         grid.add_column(f"<= {k}", justify="right")
+    for k in range(most_walls):
+        grid.add_column(f"{k} w" if k == 0 else f"<= {k} w", justify="right")
     for s in summary.stations:
         grid.add_row(
             s.station_id,
@@ -84,11 +92,19 @@ def print_build_summary(summary: "BuildSummary") -> None:
             f"{s.num_bytes / 1e6:.1f}",
             f"{s.lost_ray_share:.3%}",
             *(f"{share:.0%}" for share in s.coverage),
+            *("" for _ in range(most_reflections - len(s.coverage))),
+            *(f"{share:.0%}" for share in s.wall_coverage[:most_walls]),
         )
     grid.caption = (
         "filled: cells with rays; tubes: components of their mixtures; lost: rays that left the scene; "
         "<= k: fraction of the free space that paths with at most k reflections reach"
     )
+    if most_walls:
+        cut = max(s.cut_power_share for s in summary.stations)
+        grid.caption += (
+            "; <= k w: the same of straight paths through at most k walls, so that 0 w is line of sight. "
+            f"Rays that ended for weakness had at most {cut:.2%} of a station's power"
+        )
     console = Console()
     console.print(grid)
     for s in summary.stations:
@@ -127,6 +143,8 @@ def table_info(table: Table) -> dict[str, Any]:
                 "position_m": list(part.station.position),
                 "lost_ray_share": part.lost_ray_share,
                 "coverage": list(part.coverage),
+                "wall_coverage": list(part.wall_coverage),
+                "cut_power_share": part.cut_power_share,
                 "update": _update_info(part.update),
                 "levels": [
                     {

@@ -110,7 +110,13 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
     bare = median_seconds(lambda: [scene.run(*query) for query in recorder.queries])
     del mesh
     stage = median_seconds(run_stage)
-    prior = fill_path_prior(rays, segments, twin.free_space, exponent=exponent, refinement=RaySettings.prior_refinement)
+    prior = fill_path_prior(
+        rays,
+        segments,
+        twin.free_space,
+        exponent=exponent,
+        refinement=RaySettings.prior_refinement,
+    )
     print(
         f"rays: {len(rays)} with up to {propagation.max_reflections} reflections, {num_segments} segments\n"
         f"  ray stage          {num_segments / stage / 1e6:6.2f} million rays/s\n"
@@ -121,7 +127,11 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
         "rays": stage,
         "path prior": median_seconds(
             lambda: fill_path_prior(
-                rays, segments, twin.free_space, exponent=exponent, refinement=RaySettings.prior_refinement
+                rays,
+                segments,
+                twin.free_space,
+                exponent=exponent,
+                refinement=RaySettings.prior_refinement,
             )
         ),
         "pieces": median_seconds(

@@ -14,6 +14,7 @@ from rayfix_offline.rays.segments import Segments
 from rayfix_offline.scene.engine import EmbreeEngine
 from rayfix_offline.scene.walls import Walls, opaque_walls
 from rayfix_offline.twin.planes import merge_coplanar
+from tests.support.oracles.rays import Rows
 from tests.support.scenes.rooms import CABINET, ROOM, TABLE, scene_of_boxes
 from tests.support.scenes.shapes import box
 
@@ -55,6 +56,16 @@ def launch_in() -> Callable[..., Segments]:
             max_reflections=max_reflections,
             max_path_length=max_path_length,
         )
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def launch_rows(launch_in: Callable[..., Segments]) -> Callable[..., Rows]:
+    """Return a function that launches rays among opaque triangles, one row for each."""
+
+    def run(*args: Any, **options: Any) -> Rows:
+        return Rows.of(launch_in(*args, **options))
 
     return run
 

@@ -138,14 +138,14 @@ def points_on_rays(
     """
     segments = launcher.trace(station, directions)
     phase = step * rng.random(len(directions))
-    ray, depth = np.nonzero(segments.sequence >= 0)
-    first = np.ceil((segments.start[ray, depth] - phase[ray]) / step).astype(np.int64)
-    last = np.ceil((segments.end[ray, depth] - phase[ray]) / step).astype(np.int64)
+    ray = segments.ray
+    first = np.ceil((segments.start - phase[ray]) / step).astype(np.int64)
+    last = np.ceil((segments.end - phase[ray]) / step).astype(np.int64)
     counts = np.maximum(last - first, 0)
     which = np.repeat(np.arange(len(ray)), counts)
     number = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts) + first[which]
     length = phase[ray[which]] + step * number
-    sequence = segments.sequence[ray, depth][which]
+    sequence = segments.sequence[which]
     images, mirrors = segments.sequences.images, segments.sequences.mirrors
-    heading = np.einsum("nij,nj->ni", mirrors[segments.sequence[ray, depth]], directions[ray])
+    heading = np.einsum("nij,nj->ni", mirrors[segments.sequence], directions[ray])
     return RayPoints(position=images[sequence] + length[:, None] * heading[which], path_length=length)

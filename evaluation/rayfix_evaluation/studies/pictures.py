@@ -123,9 +123,9 @@ def _polylines(launcher: Launcher, origin: Array, measured: Direction, rng: np.r
     corners = []
     for ray, heading in enumerate(directions):
         found = [origin]
-        for depth in np.flatnonzero(segments.sequence[ray] >= 0):
-            sequence = segments.sequence[ray, depth]
-            found.append(images[sequence] + segments.end[ray, depth] * (mirrors[sequence] @ heading))
+        for n in range(segments.offsets[ray], segments.offsets[ray + 1]):
+            sequence = segments.sequence[n]
+            found.append(images[sequence] + segments.end[n] * (mirrors[sequence] @ heading))
         corners.append(np.array(found))
     return corners
 

@@ -81,12 +81,12 @@ def find_escapes(station: StationSection, twin: Twin, *, max_reflections: int) -
         max_path_length=ENDLESS,
     )
     # One segment more than is checked: a ray without it has left the scene before.
-    lost = np.flatnonzero(segments.sequence[:, depth] < 0)
+    lost = np.flatnonzero(np.diff(segments.offsets) <= depth)
     share = len(lost) / len(rays)
     if not len(lost):
         return Escapes(station_id=station.id, share=share, side=None, side_share=0.0, place=None, place_share=0.0)
-    last = (segments.sequence[lost] >= 0).sum(axis=1) - 1
-    sequence, length = segments.sequence[lost, last], segments.end[lost, last]
+    last = segments.offsets[lost + 1] - 1
+    sequence, length = segments.sequence[last], segments.end[last]
     heading = np.einsum("nij,nj->ni", segments.sequences.mirrors[sequence], rays.directions[lost])
     ends = segments.sequences.images[sequence] + length[:, None] * heading
     place, count = _densest(ends)

@@ -54,15 +54,20 @@ class StationTrace:
         Fraction of the rays that left the scene instead of hitting a surface.
     coverage : tuple of float
         Fraction of the free space that is reached with at most 0, 1, 2, ... reflections.
+    wall_coverage, cut_power_share
+        As in :class:`~rayfix_tables.part.StationPart`.
     """
 
     finest: LevelRays
     lost_ray_share: float
     coverage: tuple[float, ...]
+    wall_coverage: tuple[float, ...]
+    cut_power_share: float
 
     def to_arrays(self) -> dict[str, NDArray[np.float64]]:
         """Return the statistics of the launch as the arrays of a shard."""
-        return {"lost_ray_share": np.array(self.lost_ray_share), "coverage": np.array(self.coverage)}
+        names = ("lost_ray_share", "coverage", "wall_coverage", "cut_power_share")
+        return {name: np.array(getattr(self, name)) for name in names}
 
 
 def level_grid(window: float, *, cells_per_window: float = RaySettings.cells_per_window) -> AngularGrid:
@@ -117,7 +122,7 @@ def trace_station(
             spacing,
             np.random.default_rng([site.table.seed, *seed]),
             walls=walls,
-            mirror_offset=settings.mirror_offset,
+            settings=settings,
         )
 
     name = int.from_bytes(hashlib.sha256(station.id.encode()).digest()[:8], "big")
@@ -151,7 +156,13 @@ def trace_station(
         sequences=segments.sequences,
         surface_sequences=surface_sequences(segments.sequences, twin.planes),
     )
-    return StationTrace(finest=finest, lost_ray_share=prior_segments.lost_ray_share, coverage=prior.coverage)
+    return StationTrace(
+        finest=finest,
+        lost_ray_share=prior_segments.lost_ray_share,
+        coverage=prior.coverage,
+        wall_coverage=prior.wall_coverage,
+        cut_power_share=segments.cut_power_share,
+    )
 
 
 def launch_rays(
@@ -162,7 +173,7 @@ def launch_rays(
     rng: np.random.Generator,
     *,
     walls: Walls | None = None,
-    mirror_offset: float = RaySettings.mirror_offset,
+    settings: RaySettings | None = None,
 ) -> tuple[RaySet, Segments]:
     """Launch a station's rays.
 
@@ -172,8 +183,7 @@ def launch_rays(
         Between neighbouring rays.
     walls : Walls, optional
         The site's when left out.
-    mirror_offset : float
-        See :func:`~rayfix_offline.rays.launch.launch`.
+    settings : RaySettings, optional
     """
     rays = sample_rays(spacing, rng)
     segments = launch(
@@ -185,6 +195,6 @@ def launch_rays(
         bounds=twin.scene.bounds,
         max_reflections=site.propagation.max_reflections,
         max_path_length=site.propagation.max_path_length_m,
-        mirror_offset=mirror_offset,
+        settings=settings,
     )
     return rays, segments

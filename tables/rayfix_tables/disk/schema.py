@@ -13,16 +13,19 @@ from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
 from rayfix_tables.site import NO_BIAS, Mounting, Station, StationBias
 
 FORMAT = "rayfix-table"
-FORMAT_VERSION = 2
-"""Version that is written."""
+FORMAT_VERSION = 3
+"""Version of tables with datasets of walls: :data:`NUM_WALLS` or :data:`FACE_THICKNESS`."""
+
+WITHOUT_WALLS = 2
+"""Version of all other tables, which earlier versions of the software read."""
 
 TEXT_IN_HEAPS = 1
 """Older version that is also read: its texts are attributes of variable length, stored in a heap of the file."""
 
-READ_VERSIONS = (TEXT_IN_HEAPS, FORMAT_VERSION)
+READ_VERSIONS = (TEXT_IN_HEAPS, WITHOUT_WALLS, FORMAT_VERSION)
 
 ARRAYS_VERSION = 1
-"""Version of the meaning of a part's arrays. It is the same in both format versions, which permits reuse of parts."""
+"""Version of the meaning of a part's arrays. It is the same in all format versions, which permits reuse of parts."""
 
 TEXT_DATASETS: dict[str, tuple[type[np.generic], int]] = {"site": (np.uint8, 1), "scene/materials": (np.uint8, 1)}
 """Type and number of axes of the datasets that hold JSON, in UTF-8."""
@@ -39,9 +42,15 @@ LEVEL_DATASETS: dict[str, tuple[type[np.generic], int]] = {
     "ring_cells": (np.int64, 1),
     "cell_offsets": (np.int64, 1),
     "cell_log_mass": (np.float64, 1),
-    **{name: (FIELD_DTYPES[name], 1 + len(shape)) for name, shape in FIELD_SHAPES.items()},
+    **{name: (FIELD_DTYPES[name], 1 + len(shape)) for name, shape in FIELD_SHAPES.items() if name != "num_walls"},
 }
 """Type and number of axes of a level's datasets."""
+
+FACE_THICKNESS: tuple[type[np.generic], int] = (np.float64, 1)
+"""Type and number of axes of ``scene/face_thickness_m``, which only scenes with a known thickness have."""
+
+NUM_WALLS: tuple[type[np.generic], int] = (FIELD_DTYPES["num_walls"], 1)
+"""Type and number of axes of a level's ``num_walls``, which only levels with paths through walls have."""
 
 LOG_BALANCE: tuple[type[np.generic], int] = (np.float32, 1)
 """Type and number of axes of a level's ``log_balance``, which only balanced levels have."""

@@ -50,7 +50,7 @@ def traced(clutter: NDArray[np.float64], launch_in: Launch) -> Traced:
 def gather(traced: Traced, centre: tuple[float, float], window: float, rows: NDArray[np.int32] | None = None) -> Groups:
     """Run the kernel; groups by sequence and slice."""
     rays, pieces = traced.rays, traced.pieces
-    sequence, slices, mass, mean, cov = gather_groups(
+    sequence, slices, _, mass, mean, cov = gather_groups(
         *centre,
         window,
         RayFit.cutoff,

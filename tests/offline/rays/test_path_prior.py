@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from rayfix_evaluation.truth.forward import ForwardSolver
-from rayfix_offline.rays.pathprior import PathPrior, fill_path_prior, reflection_factors
+from rayfix_offline.rays.pathprior import PathPrior, fill_path_prior, wall_factors
 from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments
 from rayfix_tables.freespace import FreeSpace
@@ -42,12 +42,12 @@ def distances(prior: PathPrior, place: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(np.linalg.norm(centres(prior) - place, axis=-1))
 
 
-def test_reflection_factors(rays: RaySet, room: NDArray[np.float64], launch_in: Launch) -> None:
+def test_wall_factors(rays: RaySet, room: NDArray[np.float64], launch_in: Launch) -> None:
     """6 dB are a factor of 0.251 in power; to the power of beta = 2, 0.0631."""
     segments = launch_in(room, STATION, rays.directions[:100], max_reflections=2)
-    expected = np.broadcast_to([1.0, 10**-1.2, 10**-2.4], (100, 3))
-    np.testing.assert_allclose(reflection_factors(segments, 2.0), expected, rtol=1e-14)
-    np.testing.assert_array_equal(reflection_factors(segments, 0.0), 1.0)
+    expected = np.tile([1.0, 10**-1.2, 10**-2.4], 100)
+    np.testing.assert_allclose(wall_factors(segments, 2.0), expected, rtol=1e-14)
+    np.testing.assert_array_equal(wall_factors(segments, 0.0), 1.0)
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])

@@ -18,7 +18,6 @@ from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_evaluation.truth.fresnel import half_space
 from rayfix_evaluation.truth.walls import Walls as SolverWalls
 from rayfix_offline.build import build_table
-from rayfix_offline.rays.segments import Segments
 from rayfix_offline.rays.trace import scene_walls
 from rayfix_offline.scene.materials import (
     ITU_MATERIALS,
@@ -33,9 +32,10 @@ from rayfix_offline.scene.walls import Walls, opaque_walls
 from rayfix_offline.site import read_site
 from rayfix_offline.twin.twin import prepare_twin, refuse_errors
 from rayfix_tables.table import Table
+from tests.support.oracles.rays import Rows
 
 WriteSite = Callable[..., Path]
-Launch = Callable[..., Segments]
+Launch = Callable[..., Rows]
 cosines = st.floats(0.0, 1.0)
 permittivities = st.builds(lambda re, im: complex(re, -im), st.floats(1.0, 100.0), st.floats(0.0, 1e8))
 
@@ -211,17 +211,17 @@ def corridor() -> NDArray[np.float64]:
     return np.concatenate([floor, floor + np.array([0, 0, 2])])
 
 
-def test_losses_add_up_along_a_ray(launch_in: Launch) -> None:
+def test_losses_add_up_along_a_ray(launch_rows: Launch) -> None:
     """A ray at 60 deg from the vertical between a concrete floor and a ceiling of 7 dB: down, up, down."""
     concrete = known("concrete", 3.5)
     walls = half_spaces(np.array([concrete, concrete, np.nan, np.nan]), 7.0)
     heading = np.array([[np.sqrt(0.75), 0.0, -0.5]])
-    segments = launch_in(corridor(), (0, 0.1, 1), heading, max_reflections=3, walls=walls)
+    segments = launch_rows(corridor(), (0, 0.1, 1), heading, max_reflections=3, walls=walls)
     floor = np.log10(fresnel_power(0.5, concrete))
     np.testing.assert_allclose(segments.log_gain, [[0.0, floor, floor - 0.7, 2 * floor - 0.7]], rtol=1e-12)
 
 
-def test_paths_of_launcher_and_solver_are_alike(launch_in: Launch, clutter: NDArray[np.float64]) -> None:
+def test_paths_of_launcher_and_solver_are_alike(launch_rows: Launch, clutter: NDArray[np.float64]) -> None:
     """Each launched ray meets the image method's paths with the same gain: walls, cabinet and table differ."""
     face_materials = np.repeat(np.arange(3), 12).astype(np.int16)
     materials = ("itu_plasterboard", "itu_metal", "oak")
@@ -243,7 +243,7 @@ def test_paths_of_launcher_and_solver_are_alike(launch_in: Launch, clutter: NDAr
         ],
         axis=1,
     )
-    segments = launch_in(clutter, station, heading, max_reflections=2, walls=walls)
+    segments = launch_rows(clutter, station, heading, max_reflections=2, walls=walls)
     log_gain = segments.log_gain[np.arange(len(paths)), paths.num_reflections]
     np.testing.assert_allclose(10.0 * log_gain - 20.0 * np.log10(paths.path_length), paths.gain_db, rtol=0, atol=1e-6)
     assert len(paths) > 10

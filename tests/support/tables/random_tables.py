@@ -32,6 +32,7 @@ def random_mixture(rng: np.random.Generator, count: int) -> TubeMixture:
     """Numbers of no meaning in the types of a table."""
     fields = {name: rng.normal(size=(count, *shape)).astype(np.float32) for name, shape in FIELD_SHAPES.items()}
     fields["num_reflections"] = rng.integers(0, 4, count).astype(np.int8)
+    fields["num_walls"] = rng.integers(0, 3, count).astype(np.int8)
     return TubeMixture(**fields)
 
 
