@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix.example.files import Example, write_example
-from rayfix_evaluation.drops.walls import walls_of_twin
+from rayfix_evaluation.truth.scene_walls import walls_of_twin
 from rayfix_evaluation.truth.walls import Walls
 from rayfix_offline.scene.materials import itu_name
 from rayfix_offline.scene.scene import load_scene

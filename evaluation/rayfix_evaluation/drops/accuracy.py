@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from rayfix_evaluation.drops.bound import position_error_bound
 from rayfix_evaluation.drops.simulate import Noise, Rule, Timing, select_path, simulate_report, uniform_drops
-from rayfix_evaluation.drops.walls import walls_of_table
 from rayfix_evaluation.truth.forward import ForwardSolver, Paths
+from rayfix_evaluation.truth.scene_walls import walls_of_table
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report

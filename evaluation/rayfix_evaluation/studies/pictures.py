@@ -116,18 +116,13 @@ def _choose(bench: Bench, heard: Sequence[int]) -> int:
 
 
 def _polylines(launcher: Launcher, origin: Array, measured: Direction, rng: np.random.Generator) -> list[Array]:
-    """Corners of some rays around a measured direction, each of shape (n, 3), m."""
+    """Straight pieces of some rays around a measured direction, each of shape (2, 3), m."""
     directions = draw_directions(measured, _RAYS, rng)
     segments = launcher.trace(origin, directions)
     images, mirrors = segments.sequences.images, segments.sequences.mirrors
-    corners = []
-    for ray, heading in enumerate(directions):
-        found = [origin]
-        for n in range(segments.offsets[ray], segments.offsets[ray + 1]):
-            sequence = segments.sequence[n]
-            found.append(images[sequence] + segments.end[n] * (mirrors[sequence] @ heading))
-        corners.append(np.array(found))
-    return corners
+    heading = np.einsum("nij,nj->ni", mirrors[segments.sequence], directions[segments.ray])
+    ends = [images[segments.sequence] + at[:, None] * heading for at in (segments.start, segments.end)]
+    return list(np.stack(ends, axis=1))
 
 
 def _differences(clouds: dict[str, RayPoints], ranges: dict[str, tuple[float, float]] | Any) -> dict[str, Any] | None:

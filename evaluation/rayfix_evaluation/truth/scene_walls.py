@@ -1,4 +1,4 @@
-"""What the walls of a table's scene are made of, as the forward solver takes it.
+"""What the walls of a table's scene are made of, as rays and the forward solver take it.
 
 Only the materials come from the software that builds tables: permittivities, thicknesses, constant losses, and which
 triangles enclose a solid. What these do to a path is the forward solver's own.
@@ -17,7 +17,13 @@ from rayfix_tables.table import Table
 
 
 def walls_of_table(table: Table) -> Walls | None:
-    """Return the walls of a table's scene; None if all are opaque and reflect with one loss."""
+    """Return the walls of a table's scene for the solver; None if all are opaque and reflect with one loss."""
+    found = scene_walls_of_table(table)
+    return None if found is None else _walls(found)
+
+
+def scene_walls_of_table(table: Table) -> SceneWalls | None:
+    """Return the walls of a table's scene for rays; None if all are opaque and reflect with one loss."""
     document = table.site.document
     if document["propagation"].get("reflection", "constant") == "constant" and not document.get("materials"):
         return None  # also of tables whose software knew no materials
@@ -31,13 +37,14 @@ def walls_of_table(table: Table) -> Walls | None:
         materials=stored.materials,
         face_objects=np.zeros(count, np.int32),
         objects=("scene",),
+        face_thickness=None if stored.face_thickness is None else np.array(stored.face_thickness),
     )
     sheets = opaque_walls(count, loss_db=0.0)
     found = walls_of(site, scene, sheets.solid, sheets.outward)
     if found.passable.any():
         # Only now does it matter which of them enclose solids.
-        return walls_of_twin(prepare_scene(site, scene))
-    return _walls(found)
+        return scene_walls(site, prepare_scene(site, scene))
+    return found
 
 
 def walls_of_twin(twin: Twin) -> Walls:
