@@ -24,6 +24,7 @@ class ViewerSettings(BaseModel):
 
     simulation: bool = Field(description="whether POST /v1/simulations answers")
     max_reflections: int = Field(description="largest number of reflections of a path in the table")
+    open_materials: list[str] = Field(description="materials of the scene that let signals through")
 
 
 class CellSummary(BaseModel):

@@ -253,7 +253,7 @@ def test_places_without_signal_are_refused(web: RunningApp, table: Table):
 
 def test_a_service_may_refuse_to_simulate(hall_table_path: Path):
     with RunningApp(hall_table_path, simulation=False) as web:
-        assert web.get("/v1/viewer").json() == {"simulation": False, "max_reflections": 2}
+        assert web.get("/v1/viewer").json() == {"simulation": False, "max_reflections": 2, "open_materials": []}
         response = web.post("/v1/simulations", {"position": [1, 2, 1]})
     assert response.status_code == 403
     assert "--allow-simulation" in response.json()["detail"]

@@ -31,6 +31,8 @@ export interface StationInfo {
 export interface ViewerSettings {
   simulation: boolean;
   max_reflections: number;
+  /** Materials of the scene that let signals through. */
+  open_materials: string[];
 }
 
 export interface Measurement {
