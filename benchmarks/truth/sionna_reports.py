@@ -38,6 +38,13 @@ HEARD_DB = 40.0
 """A station whose strongest path is weaker than the best station's by more reports nothing."""
 REGION = 0.9
 _KINDS = ("opaque", "transmission")
+_WAYS = {
+    (False, False): "unobstructed",
+    (False, True): "straight through walls",
+    (True, False): "reflected",
+    (True, True): "reflected and through walls",
+}
+"""Ways of paths, by whether they are reflected and whether they pass walls."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -118,17 +125,11 @@ def reported_share(drops: Mapping[str, Array]) -> str:
     kinds = []
     for number in range(len(drops["position"])):
         for s, k in strongest(drops, number).items():
-            bounced = drops["num_reflections"][number, s, k] > 0
-            passed = drops["num_walls"][number, s, k] > 0
-            kinds.append("other" if drops["others"][number, s, k] else f"{'bounced' * bounced}{'through' * passed}")
-    names = {
-        "": "unobstructed",
-        "through": "straight through walls",
-        "bounced": "reflected",
-        "bouncedthrough": "reflected and through walls",
-        "other": "diffracted or scattered",
-    }
-    return ", ".join(f"{kinds.count(kind) / max(len(kinds), 1):.1%} {name}" for kind, name in names.items())
+            bounced = bool(drops["num_reflections"][number, s, k])
+            passed = bool(drops["num_walls"][number, s, k])
+            kinds.append("diffracted or scattered" if drops["others"][number, s, k] else _WAYS[bounced, passed])
+    names = (*_WAYS.values(), "diffracted or scattered")
+    return ", ".join(f"{kinds.count(name) / max(len(kinds), 1):.1%} {name}" for name in names)
 
 
 def ask(drops: Mapping[str, Array], table: Table, degrees: float, timing: Timing, seed: int) -> list[Question]:

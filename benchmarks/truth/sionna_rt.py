@@ -34,6 +34,9 @@ _SHAPE = """<bsdf type="itu-radio-material" id="{material}-{n}">
 </shape>
 """
 
+_MOST_PATHS = 4_000_000
+"""Candidates for which Sionna RT keeps room; beyond these it drops paths silently."""
+
 _SPECULAR, _DIFFUSE, _REFRACTION, _DIFFRACTION = 1, 2, 4, 8
 
 
@@ -84,7 +87,10 @@ class Physics:
     diffraction : bool
         At wedges and at free edges.
     scattering : float
-        Share of the reflected amplitude that is scattered; 0 for none.
+        Share of the reflected amplitude that is scattered and that reflections lack; 0 for none.
+    trace_scattered : bool
+        Whether scattered rays are traced, too. Each carries next to nothing, and there are so many of them that with
+        several receivers other paths find no room.
     """
 
     carrier_ghz: float = 3.5
@@ -92,6 +98,7 @@ class Physics:
     max_interactions: int | None = None
     diffraction: bool = False
     scattering: float = 0.0
+    trace_scattered: bool = False
 
 
 def sionna_paths(
@@ -163,12 +170,13 @@ def sionna_paths(
             max_depth=physics.max_interactions or max_reflections,
             los=True,
             specular_reflection=True,
-            diffuse_reflection=physics.scattering > 0.0,
+            diffuse_reflection=physics.trace_scattered,
             refraction=physics.refraction,
             diffraction=physics.diffraction,
             edge_diffraction=physics.diffraction,
             synthetic_array=True,
             samples_per_src=samples,
+            max_num_paths_per_src=_MOST_PATHS,
             seed=seed,
         )
         end = (paths.phi_t, paths.theta_t) if from_stations else (paths.phi_r, paths.theta_r)
