@@ -1,7 +1,8 @@
 """Drops in a site whose paths Sionna RT finds, with all its mechanisms, written into a file.
 
 Reflection, refraction, diffraction, and what scattering takes from reflections. More rays or more drops at a time find
-more candidates than Sionna RT keeps, and it then misses some of the strongest paths. Needs the extra ``sionna`` and LLVM; see docs/evaluation.md. ``benchmarks.truth.sionna_reports`` makes reports of them.
+more candidates than Sionna RT keeps, and it then misses some of the strongest paths. Needs the extra ``sionna`` and
+LLVM; see docs/evaluation.md. ``benchmarks.truth.sionna_reports`` makes reports of the drops.
 """
 
 import argparse
