@@ -148,6 +148,8 @@ def sionna_paths(
         for n, material in enumerate(sorted(set(names))):
             mesh = trimesh.Trimesh(vertices=vertices, faces=faces[names == material], process=False)
             mesh.remove_unreferenced_vertices()
+            # An edge is one only where triangles share their corners.
+            mesh.merge_vertices()
             mesh.export(Path(folder) / f"{n}.ply", vertex_normal=False)
             thick = (thickness or {}).get(material, 0.1)
             shapes.append(_SHAPE.format(n=n, material=material, thickness=thick, scattering=physics.scattering))

@@ -15,6 +15,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rayfix_evaluation.truth.diffraction import DiffractedPaths, diffracted_paths
+from rayfix_evaluation.truth.edges import Edges, find_edges
 from rayfix_evaluation.truth.forward_kernels import trace_paths, visible
 from rayfix_evaluation.truth.images import image_tree, mirror_scene
 from rayfix_evaluation.truth.interactions import Interactions, Polarisation, interactions
@@ -96,6 +98,8 @@ class ForwardSolver:
         Paths that bounces and walls weaken by more than this are left out, dB.
     polarisation : {"mixed", "kept"}
         How the losses of both polarisations are averaged.
+    edges : Edges or None
+        Edges that bend paths, which :meth:`StationSolver.diffracted` finds; None if they were not asked for.
     """
 
     scene: MirrorScene
@@ -105,6 +109,7 @@ class ForwardSolver:
     walls: Walls | None = None
     max_loss_db: float = np.inf
     polarisation: Polarisation = "mixed"
+    edges: Edges | None = None
 
     @classmethod
     def from_mesh(
@@ -118,6 +123,7 @@ class ForwardSolver:
         walls: Walls | None = None,
         max_loss_db: float = np.inf,
         polarisation: Polarisation = "mixed",
+        diffraction: bool = False,
     ) -> "ForwardSolver":
         """Merge a mesh's coplanar triangles into mirrors and prepare the visibility tests.
 
@@ -140,6 +146,8 @@ class ForwardSolver:
         polarisation : {"mixed", "kept"}
             How the losses of both polarisations are averaged: at each interaction, as tables do, or at the transmitter
             only.
+        diffraction : bool
+            Whether to prepare the edges that bend paths. It needs walls, which state the carrier.
 
         Returns
         -------
@@ -162,7 +170,10 @@ class ForwardSolver:
         triangles = np.asarray(faces, dtype=np.int64)
         if walls is not None and len(walls) != len(triangles):
             raise ValueError(f"the walls have {len(walls)} faces and the mesh {len(triangles)}; they must be the same")
-        scene = mirror_scene(np.asarray(vertices, dtype=np.float64), triangles, walls)
+        if diffraction and walls is None:
+            raise ValueError("diffraction depends on the carrier; give walls, which state it")
+        places = np.asarray(vertices, dtype=np.float64)
+        scene = mirror_scene(places, triangles, walls)
         return cls(
             scene=scene,
             max_reflections=max_reflections,
@@ -172,6 +183,7 @@ class ForwardSolver:
             walls=None if walls is None else walls.of_faces(scene.triangle_faces),
             max_loss_db=float(max_loss_db),
             polarisation=polarisation,
+            edges=find_edges(scene, places[triangles][scene.triangle_faces]) if diffraction else None,
         )
 
     @property
@@ -291,6 +303,36 @@ class StationSolver:
             vertices=vertices,
             crossings=met.crossings,
         ).chosen(order)
+
+    def diffracted(self, point: ArrayLike) -> DiffractedPaths:
+        """Find the paths to a point that bend once round an edge and are not reflected.
+
+        Parameters
+        ----------
+        point : ndarray of shape (3,), m
+            Position of the transmitter.
+
+        Returns
+        -------
+        DiffractedPaths
+            Sorted by descending gain; through walls that let signals through, in any number.
+
+        Raises
+        ------
+        ValueError
+            If the solver was made without diffraction.
+        """
+        solver = self.solver
+        if solver.edges is None or solver.walls is None:
+            raise ValueError("this solver has no edges; make it with diffraction=True")
+        return diffracted_paths(
+            solver.scene,
+            solver.walls,
+            solver.edges,
+            self.position,
+            _position(point, "point"),
+            constant_loss_db=solver.reflection_loss_db,
+        )
 
     def _interactions(self, sequences: NDArray[np.int64], vertices: NDArray[np.float64]) -> Interactions:
         solver = self.solver

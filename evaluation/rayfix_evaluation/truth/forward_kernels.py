@@ -206,6 +206,15 @@ def visible(scene: "MirrorScene", start: NDArray[np.float64], ends: NDArray[np.f
 
 
 @njit(cache=True, nogil=True)
+def visible_through(scene: "MirrorScene", start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether nothing opaque crosses the straight segments from one point to others; see :func:`visible`."""
+    out = np.empty(len(ends), np.bool_)
+    for i in range(len(ends)):
+        out[i] = not _blocked(scene, start, ends[i], -1, -1, False)
+    return out
+
+
+@njit(cache=True, nogil=True)
 def _trace_back(
     scene: "MirrorScene",
     tree: "ImageTree",

@@ -1,6 +1,6 @@
 """What bounces and passages do to paths: the power that is left, and the length that slabs add."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -95,24 +95,13 @@ def interactions(
         coefficients=walls.reflection(triangles, cosine, thickness, constant_loss_db=constant_loss_db),
         reflects=np.ones(len(path), np.bool_),
     )
-    where, found = walls_on_paths(scene, sequences, vertices)
-    passed, segment, entered = where.T
-    thickness = np.where(np.isnan(found[:, 4]), walls.thickness[entered], found[:, 4])
-    start = vertices[passed, segment]
-    passages = _Events(
-        path=passed,
-        place=np.stack([segment.astype(np.float64), np.linalg.norm(found[:, :3] - start, axis=1)], axis=1),
-        incoming=_unit(vertices[passed, segment + 1] - start),
-        normal=scene.triangle_normals[entered],
-        coefficients=walls.transmission(entered, found[:, 3], thickness),
-        reflects=np.zeros(len(passed), np.bool_),
-    )
-    num_walls = np.bincount(passed, minlength=count)
+    passages, places, lengths = _passages(scene, walls, sequences, vertices)
+    num_walls = np.bincount(passages.path, minlength=count)
     excess = np.zeros(count)
-    np.add.at(excess, passed, walls.excess(entered, found[:, 3], thickness))
-    rank = np.arange(len(passed)) - np.repeat(np.cumsum(num_walls) - num_walls, num_walls)
+    np.add.at(excess, passages.path, lengths)
+    rank = np.arange(len(places)) - np.repeat(np.cumsum(num_walls) - num_walls, num_walls)
     crossings = np.repeat(vertices[:, -1:], int(num_walls.max(initial=0)), axis=1)
-    crossings[passed, rank] = found[:, :3]
+    crossings[passages.path, rank] = places
     power = _power(bounces, passages, count) if polarisation == "mixed" else _kept_power(bounces, passages, count)
     return Interactions(
         gain_db=np.asarray(10.0 * np.log10(np.maximum(power, 10.0 ** (_LEAST_DB / 10.0)))),
@@ -138,6 +127,49 @@ class _Events:
     reflects: NDArray[np.bool_]
 
 
+def field_through(
+    scene: MirrorScene, walls: Walls, starts: Array, ends: Array, field: NDArray[np.complex128]
+) -> tuple[NDArray[np.complex128], NDArray[np.int64], Array]:
+    """Follow fields along straight segments through walls.
+
+    Parameters
+    ----------
+    scene, walls
+        As in :func:`interactions`.
+    starts, ends : ndarray of shape (n, 3), m
+    field : ndarray of complex of shape (n, 3, 2)
+        Of two polarisations, across the segments.
+
+    Returns
+    -------
+    field : ndarray of complex of shape (n, 3, 2)
+    num_walls : ndarray of int of shape (n,)
+    excess_length : ndarray of shape (n,), m
+    """
+    vertices = np.stack([starts, ends], axis=1)
+    passages, _, lengths = _passages(scene, walls, np.full((len(starts), 0), -1), vertices)
+    excess = np.zeros(len(starts))
+    np.add.at(excess, passages.path, lengths)
+    return _followed(field, passages), np.bincount(passages.path, minlength=len(starts)), excess
+
+
+def _passages(scene: MirrorScene, walls: Walls, sequences: Indices, vertices: Array) -> tuple[_Events, Array, Array]:
+    """Walls that paths pass, where they are entered, and the lengths that they add."""
+    where, found = walls_on_paths(scene, sequences, vertices)
+    passed, segment, entered = where.T
+    thickness = np.where(np.isnan(found[:, 4]), walls.thickness[entered], found[:, 4])
+    start = vertices[passed, segment]
+    events = _Events(
+        path=passed,
+        place=np.stack([segment.astype(np.float64), np.linalg.norm(found[:, :3] - start, axis=1)], axis=1),
+        incoming=_unit(vertices[passed, segment + 1] - start),
+        normal=scene.triangle_normals[entered],
+        coefficients=walls.transmission(entered, found[:, 3], thickness),
+        reflects=np.zeros(len(passed), np.bool_),
+    )
+    return events, found[:, :3], walls.excess(entered, found[:, 3], thickness)
+
+
 def _power(bounces: _Events, passages: _Events, count: int) -> Array:
     """Product of the interactions' mean powers, shape (n_paths,)."""
     power = np.ones(count)
@@ -151,22 +183,33 @@ def _power(bounces: _Events, passages: _Events, count: int) -> Array:
 
 def _kept_power(bounces: _Events, passages: _Events, count: int) -> Array:
     """Power of a field that is followed along each path, the mean over the polarisations sent, shape (n_paths,)."""
-    path = np.concatenate([bounces.path, passages.path])
-    place = np.concatenate([bounces.place, passages.place])
-    order = np.lexsort((place[:, 1], place[:, 0], path))
-    incoming, normal, coefficients, reflects = (
-        np.concatenate([getattr(bounces, name), getattr(passages, name)])[order]
-        for name in ("incoming", "normal", "coefficients", "reflects")
-    )
-    path = path[order]
+    names = [field.name for field in fields(_Events)]
+    events = _Events(**{name: np.concatenate([getattr(bounces, name), getattr(passages, name)]) for name in names})
+    numbers = np.bincount(events.path, minlength=count)
+    met = np.flatnonzero(numbers)
+    field = np.zeros((count, 3, 2), np.complex128)
+    first = events.incoming[np.lexsort((events.place[:, 1], events.place[:, 0], events.path))]
+    field[met] = sent_field(first[(np.cumsum(numbers) - numbers)[met]])
+    power = 0.5 * (np.abs(_followed(field, events)) ** 2).sum(axis=(1, 2))
+    return np.where(numbers > 0, power, 1.0)
+
+
+def sent_field(headings: Array) -> NDArray[np.complex128]:
+    """Fields of two polarisations across directions of shape (n, 3); shape (n, 3, 2)."""
+    across = _unit(np.cross(headings, np.eye(3)[np.argmin(np.abs(headings), axis=1)]))
+    return np.stack([across, np.cross(headings, across)], axis=2).astype(np.complex128)
+
+
+def _followed(field: NDArray[np.complex128], events: _Events) -> NDArray[np.complex128]:
+    """Fields of shape (n_paths, 3, 2) after all their interactions, in the paths' order."""
+    count = len(field)
+    order = np.lexsort((events.place[:, 1], events.place[:, 0], events.path))
+    path = events.path[order]
+    incoming, normal = events.incoming[order], events.normal[order]
+    coefficients, reflects = events.coefficients[order], events.reflects[order]
     numbers = np.bincount(path, minlength=count)
     rank = np.arange(len(path)) - np.repeat(np.cumsum(numbers) - numbers, numbers)
-    field = np.zeros((count, 3, 2), np.complex128)  # of two polarisations across the first direction
-    first = rank == 0
-    across = np.cross(incoming[first], np.eye(3)[np.argmin(np.abs(incoming[first]), axis=1)])
-    across = _unit(across)
-    field[path[first], :, 0] = across
-    field[path[first], :, 1] = np.cross(incoming[first], across)
+    field = field.copy()
     for step in range(int(numbers.max(initial=0))):
         at = np.flatnonzero(rank == step)
         ray, axis, which = incoming[at], normal[at], path[at]
@@ -178,11 +221,9 @@ def _kept_power(bounces: _Events, passages: _Events, count: int) -> Array:
         onward = np.where(reflects[at][:, None], onward, ray)
         perpendicular = np.einsum("ij,ijk->ik", side, field[which]) * coefficients[at, :1]
         parallel = np.einsum("ij,ijk->ik", np.cross(ray, side), field[which]) * coefficients[at, 1:]
-        field[which] = (
-            side[:, :, None] * perpendicular[:, None] + np.cross(onward, side)[:, :, None] * parallel[:, None]
-        )
-    power = 0.5 * (np.abs(field) ** 2).sum(axis=(1, 2))
-    return np.where(numbers > 0, power, 1.0)
+        out = np.cross(onward, side)
+        field[which] = side[:, :, None] * perpendicular[:, None] + out[:, :, None] * parallel[:, None]
+    return field
 
 
 def _unit(vectors: Array) -> Array:
