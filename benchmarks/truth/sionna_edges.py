@@ -1,8 +1,9 @@
 """Paths that bend once round an edge, compared with Sionna RT in the bundled office or the site of a file.
 
 Sionna RT takes the sheets of one material for one mesh, which knows nothing of the others: a pane has free edges all
-round in the wall that holds it. The solver is therefore given edges by material. Where a wall
-follows the edge, Sionna RT's gain is up to 8 dB smaller than with the ends exchanged, and gains are not compared. Needs the extra ``sionna`` and LLVM; see docs/evaluation.md.
+round in the wall that holds it. The solver is therefore given edges by material. Where a wall follows the edge, Sionna
+RT's gain is up to 8 dB smaller than with the ends exchanged, and gains are not compared. Needs the extra ``sionna`` and
+LLVM; see docs/evaluation.md.
 """
 
 import argparse
