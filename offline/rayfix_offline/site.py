@@ -128,7 +128,7 @@ class MaterialSection(_Section):
         default=None, description="real part of the relative permittivity, instead of itu"
     )
     conductivity_s_m: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
-        default=None, description="conductivity in S/m, with permittivity; 0 unless given"
+        default=None, description="conductivity, with permittivity; 0 unless given"
     )
     reflection_loss_db: Annotated[float, Field(ge=0, le=200)] | None = Field(
         default=None, description="loss of each reflection, instead of the computed one"
