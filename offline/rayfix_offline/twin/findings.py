@@ -181,8 +181,23 @@ def wall_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
         )
     carrier = site.propagation.carrier_ghz
     for key, section in site.materials.items():
+        if section.itu is not None and itu_name(section.itu) is None:
+            yield error(
+                "material",
+                f"materials.{key}.itu = '{section.itu}' is not in ITU-R P.2040",
+                f"it has {', '.join(ITU_MATERIALS)}",
+            )
+            continue
         needs = section.thickness_m is not None and section.permittivity is None
-        if needs and section.transmission_loss_db is None and complex_permittivity(section.itu or key, carrier) is None:
+        if not needs or section.transmission_loss_db is not None:
+            continue
+        if itu_name(section.itu or key) is None:
+            yield error(
+                "material",
+                f"materials.{key} has a thickness but no permittivity",
+                "add itu, permittivity or transmission_loss_db",
+            )
+        elif complex_permittivity(section.itu or key, carrier) is None:
             yield warning(
                 "material",
                 f"the permittivity of '{key}' is not known at carrier_ghz = {carrier:g}, and its walls let nothing "
