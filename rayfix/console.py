@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from rayfix_offline.build import BuildSummary
     from rayfix_offline.check import Check
 
-
-MOST_WALLS = 4
+MOST_WALLS = 6
 """Columns of the summary of a build for numbers of walls."""
 
 
@@ -76,12 +75,8 @@ def print_build_summary(summary: "BuildSummary") -> None:
     )
     for heading in ("", "cells", "filled", "tubes", "MB", "lost"):
         grid.add_column(heading, justify="right")
-    most_reflections = max(len(s.coverage) for s in summary.stations)
-    most_walls = min(MOST_WALLS, max(len(s.wall_coverage) for s in summary.stations))
-    for k in range(most_reflections):
+    for k in range(max(len(s.coverage) for s in summary.stations)):
         grid.add_column(f"<= {k}", justify="right")
-    for k in range(most_walls):
-        grid.add_column(f"{k} w" if k == 0 else f"<= {k} w", justify="right")
     for s in summary.stations:
         grid.add_row(
             s.station_id,
@@ -92,21 +87,15 @@ def print_build_summary(summary: "BuildSummary") -> None:
             f"{s.num_bytes / 1e6:.1f}",
             f"{s.lost_ray_share:.3%}",
             *(f"{share:.0%}" for share in s.coverage),
-            *("" for _ in range(most_reflections - len(s.coverage))),
-            *(f"{share:.0%}" for share in s.wall_coverage[:most_walls]),
         )
     grid.caption = (
         "filled: cells with rays; tubes: components of their mixtures; lost: rays that left the scene; "
         "<= k: fraction of the free space that paths with at most k reflections reach"
     )
-    if most_walls:
-        cut = max(s.cut_power_share for s in summary.stations)
-        grid.caption += (
-            "; <= k w: the same of straight paths through at most k walls, so that 0 w is line of sight. "
-            f"Rays that ended for weakness had at most {cut:.2%} of a station's power"
-        )
     console = Console()
     console.print(grid)
+    if any(s.wall_coverage for s in summary.stations):
+        console.print(_wall_grid(summary))
     for s in summary.stations:
         if s.origin == "updated":
             kept = _kept(s.num_kept_cells, s.num_finest_cells, s.largest_change)
@@ -117,6 +106,31 @@ def print_build_summary(summary: "BuildSummary") -> None:
         highlight=False,
         soft_wrap=True,
     )
+
+
+def _wall_grid(summary: "BuildSummary") -> Grid:
+    """Tabulate how far straight paths through walls reach."""
+    grid = Grid(
+        "station",
+        title="Straight paths through walls",
+        title_justify="left",
+        caption_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 0, 0, 1),
+        pad_edge=False,
+    )
+    most = max(len(s.wall_coverage) for s in summary.stations)
+    for k in range(min(most, MOST_WALLS)):
+        grid.add_column(f"<= {k}", justify="right")
+    grid.add_column("cut off", justify="right")
+    for s in summary.stations:
+        shares = [f"{share:.0%}" for share in s.wall_coverage[:MOST_WALLS]]
+        grid.add_row(s.station_id, *shares, *[""] * (min(most, MOST_WALLS) - len(shares)), f"{s.cut_power_share:.2%}")
+    grid.caption = (
+        "<= k: fraction of the free space that straight paths through at most k walls reach, 0 being line of sight; "
+        "cut off: power whose rays ended for weakness"
+    )
+    return grid
 
 
 def _kept(num_kept: int, num_cells: int, largest_change: float) -> str:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from rayfix_offline.scene.materials import ITU_MATERIALS, itu_name
 from rayfix_tables.errors import SiteError
 from rayfix_tables.geometry.mounting import Boresight, boresight_of, orientation_of
 from rayfix_tables.site import Mounting, SiteInfo, Station, StationBias
@@ -128,7 +127,7 @@ class MaterialSection(_Section):
         default=None, description="real part of the relative permittivity, instead of itu"
     )
     conductivity_s_m: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
-        default=None, description="conductivity in S/m, with permittivity; 0 unless given"
+        default=None, description="conductivity, with permittivity; 0 unless given"
     )
     reflection_loss_db: Annotated[float, Field(ge=0, le=200)] | None = Field(
         default=None, description="loss of each reflection, instead of the computed one"
@@ -144,17 +143,11 @@ class MaterialSection(_Section):
 
     @model_validator(mode="after")
     def _made_of_one(self) -> "MaterialSection":
-        if self.itu is not None and itu_name(self.itu) is None:
-            raise ValueError(f"itu = '{self.itu}' is not in ITU-R P.2040, which has {', '.join(ITU_MATERIALS)}")
         if self.itu is not None and self.permittivity is not None:
             raise ValueError("itu and permittivity both state the material; give one of them")
         if self.conductivity_s_m is not None and self.permittivity is None:
             raise ValueError("conductivity_s_m needs permittivity; add it, or give itu instead")
         return self
-
-    def known(self, name: str) -> bool:
-        """Whether a material of this name has a permittivity."""
-        return self.permittivity is not None or itu_name(self.itu or name) is not None
 
 
 class TableSection(_Section):
@@ -325,16 +318,6 @@ class SiteFile(_Section):
         twice = sorted({i for i in ids if ids.count(i) > 1})
         if twice:
             raise ValueError(f"station ids must differ; more than one station is called {', '.join(twice)}")
-        return self
-
-    @model_validator(mode="after")
-    def _thick_ones_known(self) -> "SiteFile":
-        for name, material in self.materials.items():
-            if material.thickness_m is not None and material.transmission_loss_db is None and not material.known(name):
-                raise ValueError(
-                    f"materials.{name} has a thickness but no permittivity; add itu, permittivity or "
-                    "transmission_loss_db"
-                )
         return self
 
     def moved(self, by: NDArray[np.float64]) -> "SiteFile":

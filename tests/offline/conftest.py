@@ -106,7 +106,7 @@ def site_document() -> Callable[..., dict[str, Any]]:
             "stations": [{"id": "bs1", "position_m": [3.6, 0.4, 2.6]}],
         }
         for name, section in sections.items():
-            document[name] = {**document[name], **section} if isinstance(section, dict) else section
+            document[name] = {**document.get(name, {}), **section} if isinstance(section, dict) else section
         return document
 
     return make
@@ -116,9 +116,13 @@ def as_toml(document: dict[str, Any]) -> str:
     """Write a site document as TOML; its strings, numbers and lists look alike in both."""
 
     def entries(section: dict[str, Any]) -> str:
-        return "".join(f"{key} = {value!r}\n" for key, value in section.items())
+        return "".join(
+            f"{key} = {str(value).lower() if isinstance(value, bool) else repr(value)}\n"
+            for key, value in section.items()
+        )
 
     text = "".join(f"[{name}]\n{entries(document[name])}" for name in ("site", "propagation", "table"))
+    text += "".join(f"[materials.{name}]\n{entries(each)}" for name, each in document.get("materials", {}).items())
     return text + "".join(f"[[stations]]\n{entries(station)}" for station in document["stations"])
 
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rayfix_tables.disk.schema import FORMAT_VERSION, array_digest, read_text
+from rayfix_tables.disk.schema import FORMAT_VERSION, WITHOUT_WALLS, array_digest, read_text
 from rayfix_tables.errors import CorruptTableError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
@@ -45,6 +45,7 @@ def assert_same_table(table: Table, content: Any) -> None:
         assert part.station.field_of_view == pytest.approx(station.field_of_view, rel=DEGREES)
         assert vars(part.station.bias) == pytest.approx(vars(station.bias), rel=DEGREES)
         assert (part.lost_ray_share, part.coverage) == (written.lost_ray_share, written.coverage)
+        assert (part.wall_coverage, part.cut_power_share) == (written.wall_coverage, written.cut_power_share)
         assert table.levels(station.id) is part.levels
         for level, expected in zip(part.levels, written.levels, strict=True):
             assert level.window == pytest.approx(expected.window, rel=DEGREES)
@@ -61,6 +62,9 @@ def assert_same_table(table: Table, content: Any) -> None:
     assert (table.scene.materials, table.scene.sha256) == (scene.materials, scene.sha256)
     for name in ("vertices", "faces", "face_materials"):
         assert_same_bits(getattr(table.scene, name), getattr(scene, name))
+    assert (table.scene.face_thickness is None) == (scene.face_thickness is None)
+    if scene.face_thickness is not None:
+        np.testing.assert_array_equal(table.scene.face_thickness, scene.face_thickness)
     assert_same_bits(table.scene.free_space.free, scene.free_space.free)
     assert_same_bits(table.scene.free_space.origin, scene.free_space.origin)
     assert table.scene.free_space.voxel_size == scene.free_space.voxel_size
@@ -73,6 +77,7 @@ def assert_same_table(table: Table, content: Any) -> None:
     num_levels=st.integers(1, 3),
     num_faces=st.integers(1, 50),
     max_components=st.integers(0, 4),
+    walls=st.booleans(),
 )
 def test_round_trip(
     make_content: Callable[..., Any],
@@ -82,6 +87,7 @@ def test_round_trip(
     num_levels: int,
     num_faces: int,
     max_components: int,
+    walls: bool,
 ) -> None:
     path = tmp_path_factory.mktemp("tables") / "table.h5"
     content = make_content(
@@ -90,12 +96,14 @@ def test_round_trip(
         num_levels=num_levels,
         num_faces=num_faces,
         max_components=max_components,
+        walls=walls,
     )
     table_id = content.write(path)
     table = Table.open(path)
     assert_same_table(table, content)
     assert table.table_id == table_id
-    assert (table.path, table.format_version, table.software_version) == (path, FORMAT_VERSION, "1.2.3")
+    version = FORMAT_VERSION if walls else WITHOUT_WALLS
+    assert (table.path, table.format_version, table.software_version) == (path, version, "1.2.3")
     table.verify()
     assert [entry.name for entry in path.parent.iterdir()] == ["table.h5"]
 
@@ -212,7 +220,7 @@ def test_arrays_are_mapped_and_cannot_be_written(small_table_path: Path) -> None
     raw = small_table_path.read_bytes()
     with h5py.File(small_table_path) as file:
         for n, level in enumerate(table.levels("bs0")):
-            for name in FIELD_SHAPES:
+            for name in FIELD_SHAPES.keys() - {"num_walls"}:  # which only tables with walls have
                 array = getattr(level.mixture, name)
                 offset = file[f"stations/bs0/levels/{n}/{name}"].id.get_offset()
                 assert offset % 64 == 0
@@ -226,7 +234,7 @@ def test_the_site_is_plain_json(small_table_path: Path, make_content: Callable[.
     """Other programs can read it."""
     with h5py.File(small_table_path) as file:
         assert read_text(file, "format") == "rayfix-table"
-        assert file.attrs["format_version"] == FORMAT_VERSION
+        assert file.attrs["format_version"] == WITHOUT_WALLS
         document = json.loads(file["site"][()].tobytes())
     site = make_content(1).site
     assert document["station_ids"] == ["bs0", "bs1"]
@@ -315,6 +323,8 @@ def variations(content: Any) -> dict[str, Any]:
         "face_materials": with_scene(face_materials=nudged(scene.face_materials)),
         "materials": with_scene(materials=("itu_concrete", "itu_glass")),
         "sha256": with_scene(sha256="0" * 64),
+        "face_thickness": with_scene(face_thickness=np.full(len(scene.faces), 0.1)),
+        "wall_coverage": with_part(wall_coverage=(0.5,)),
         "free": with_scene(free_space=replace(space, free=~space.free)),
         "origin": with_scene(free_space=replace(space, origin=nudged(space.origin))),
         "voxel_size": with_scene(free_space=replace(space, voxel_size=0.2)),
@@ -331,7 +341,7 @@ def test_the_id_changes_with_every_part_of_the_content(make_content: Callable[..
     for name, varied in variations(content).items():
         ids[name] = varied.write(tmp_path / "t.h5")
     assert len(set(ids.values())) == len(ids)
-    assert len(ids) == 28 + len(FIELD_SHAPES)
+    assert len(ids) == 30 + len(FIELD_SHAPES)
 
 
 def with_update(content: Any, seed: int = 0) -> Any:

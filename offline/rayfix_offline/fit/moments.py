@@ -64,7 +64,7 @@ class GatheredRays(NamedTuple):
     mass: NDArray[np.float64]
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
-    excess: NDArray[np.float64]
+    excess: NDArray[np.float32]
     num_walls: NDArray[np.int8]
     images: NDArray[np.float64]
     mirrors: NDArray[np.float64]

@@ -44,7 +44,7 @@ class _Trace(NamedTuple):
     mass: NDArray[np.float64]
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
-    excess: NDArray[np.float64]
+    excess: NDArray[np.float32]
     num_walls: NDArray[np.int8]
     images: NDArray[np.float64]
     mirrors: NDArray[np.float64]

@@ -36,7 +36,7 @@ class Pieces:
     mean : ndarray of shape (n_pieces,), m
         Mean geometric path length under that weight.
     variance : ndarray of shape (n_pieces,), m2
-    excess : ndarray of shape (n_pieces,), m
+    excess : ndarray of float32, shape (n_pieces,), m
         What walls add to the measured length.
     num_walls : ndarray of int8, shape (n_pieces,)
         Walls passed before.
@@ -48,7 +48,7 @@ class Pieces:
     mass: NDArray[np.float64]
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
-    excess: NDArray[np.float64]
+    excess: NDArray[np.float32]
     num_walls: NDArray[np.int8]
 
     @cached_property
@@ -81,7 +81,7 @@ class _PieceArrays(NamedTuple):
     mass: NDArray[np.float64]
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
-    excess: NDArray[np.float64]
+    excess: NDArray[np.float32]
     num_walls: NDArray[np.int8]
 
 
@@ -122,7 +122,7 @@ def cut_pieces(
         mass=np.zeros(total),
         mean=np.zeros(total),
         variance=np.zeros(total),
-        excess=np.empty(total),
+        excess=np.empty(total, np.float32),
         num_walls=np.empty(total, np.int8),
     )
     factors = wall_factors(segments, exponent)
@@ -140,7 +140,7 @@ def cut_pieces(
             _PieceArrays(**{name: getattr(pieces, name) for name in _PieceArrays._fields}),
         )
 
-    over_ray_ranges(cut, len(rays), jobs)
+    over_ray_ranges(cut, len(segments.offsets) - 1, jobs)
     return pieces
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.scene.engine import FAR, EmbreeEngine, RayEngine
 from rayfix_offline.scene.scene import Scene, load_scene
+from rayfix_offline.scene.walls import walls_of
 from rayfix_offline.site import SiteFile
 from rayfix_offline.twin.cleaning import find_duplicates
 from rayfix_offline.twin.enclosures import find_enclosures
@@ -20,6 +21,7 @@ from rayfix_offline.twin.findings import (
     partition_findings,
     size_findings,
     station_findings,
+    wall_findings,
 )
 from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.partitions import find_partitions
@@ -110,7 +112,13 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
         *file_findings(scene),
         *mesh_findings(scene, duplicates, [part.moved(origin) for part in parts], enclosures),
         *material_findings(site, scene),
-        *partition_findings(site, scene, find_partitions(scene, free_space, closed=closed)),
+        *wall_findings(site, scene),
+        *partition_findings(
+            site,
+            scene,
+            find_partitions(scene, free_space, closed=closed),
+            walls_of(site, scene, solid, outward).passable,
+        ),
         *station_findings(site, scene, parts, enclosures, touch=settings.touch, origin=origin),
     ]
     if not free_space.free.any():

@@ -12,6 +12,7 @@ from rayfix_offline.scene.scene import Scene
 from rayfix_offline.scene.slabs import excess_length, slab_power
 from rayfix_offline.scene.walls import Walls, walls_of
 from rayfix_offline.site import SiteFile, parse_site
+from rayfix_offline.twin.findings import wall_findings
 from rayfix_offline.twin.twin import Twin, prepare_scene
 from rayfix_tables.errors import SiteError
 from tests.support.scenes.rooms import scene_of
@@ -106,8 +107,6 @@ def test_the_file_states_a_thickness_and_the_site_another() -> None:
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ({"thickness_m": 0.1}, "a thickness but no permittivity; add itu"),
-        ({"itu": "paper"}, "itu = 'paper' is not in ITU-R P.2040, which has vacuum, concrete"),
         ({"itu": "wood", "permittivity": 2.0}, "give one of them"),
         ({"conductivity_s_m": 2.0}, "conductivity_s_m needs permittivity"),
         ({"thickness_m": 0.0, "itu": "wood"}, "materials.pane.thickness_m"),
@@ -134,6 +133,30 @@ def test_the_coefficients_of_triangles() -> None:
     assert thicker[1][0] == pytest.approx(30 * excess[0])
     unmoved = replace(walls, excess_length=False).transmitted(faces, cosine, walls.thickness[faces])
     np.testing.assert_array_equal(unmoved, [[log_gain[0]], [0.0]])
+
+
+def remarked(scene: Scene, site: SiteFile) -> list[str]:
+    """Messages about materials of a scene."""
+    return [finding.message for finding in wall_findings(site, scene)]
+
+
+def test_what_is_known_of_walls_and_not_used_is_told() -> None:
+    assert remarked(one_sheet("itu_glass"), site_of({"glass": {"thickness_m": 0.01}})) == []
+    (unused,) = remarked(one_sheet("itu_glass"), site_of({"glas": {"transmission_loss_db": 3.0}}))
+    assert unused == (
+        "the site file describes 'glas', which the scene does not have; give the sections the names of the scene's "
+        "materials: 'itu_glass'"
+    )
+    (bare,) = remarked(one_sheet("pane"), site_of({"pane": {"thickness_m": 0.1}}))
+    assert bare == "materials.pane has a thickness but no permittivity; add itu, permittivity or transmission_loss_db"
+    (paper,) = remarked(one_sheet("pane"), site_of({"pane": {"itu": "paper", "thickness_m": 0.1}}))
+    assert paper.startswith("materials.pane.itu = 'paper' is not in ITU-R P.2040; it has vacuum, concrete, brick")
+    (beyond,) = remarked(one_sheet("itu_brick"), site_of({"itu_brick": {"thickness_m": 0.1}}, carrier_ghz=60.0))
+    assert beyond.startswith("the permittivity of 'itu_brick' is not known at carrier_ghz = 60, and its walls let")
+    stated = one_sheet("itu_glass", 0.01)
+    (silent,) = remarked(stated, site_of(reflection="constant"))
+    assert "states the thickness of 'itu_glass', but" in silent
+    assert remarked(stated, site_of()) == remarked(stated, site_of(reflection="constant", transmission=False)) == []
 
 
 def solid_room(inwards: bool, mixed: bool = False) -> Twin:

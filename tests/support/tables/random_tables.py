@@ -28,18 +28,31 @@ class Content:
         return write_table(path, site=self.site, scene=self.scene, parts=self.parts, software_version=software_version)
 
 
-def random_mixture(rng: np.random.Generator, count: int) -> TubeMixture:
+def random_mixture(rng: np.random.Generator, count: int, *, walls: bool = False) -> TubeMixture:
     """Numbers of no meaning in the types of a table."""
-    fields = {name: rng.normal(size=(count, *shape)).astype(np.float32) for name, shape in FIELD_SHAPES.items()}
+    fields = {
+        name: rng.normal(size=(count, *shape)).astype(np.float32)
+        for name, shape in FIELD_SHAPES.items()
+        if name != "num_walls"
+    }
     fields["num_reflections"] = rng.integers(0, 4, count).astype(np.int8)
-    fields["num_walls"] = rng.integers(0, 3, count).astype(np.int8)
+    fields["num_walls"] = (np.arange(count) % 3 if walls else np.zeros(count)).astype(np.int8)
     return TubeMixture(**fields)
 
 
 def random_content(
-    seed: int, *, num_stations: int = 2, num_levels: int = 2, num_faces: int = 5, max_components: int = 3
+    seed: int,
+    *,
+    num_stations: int = 2,
+    num_levels: int = 2,
+    num_faces: int = 5,
+    max_components: int = 3,
+    walls: bool = False,
 ) -> Content:
-    """Fill a table with random numbers; cells hold none to ``max_components`` components."""
+    """Fill a table with random numbers; cells hold none to ``max_components`` components, and paths pass walls or not.
+
+    Without walls, the numbers are those of the stored tables of former formats.
+    """
     rng = np.random.default_rng(seed)
     stations, parts = [], []
     for n in range(num_stations):
@@ -68,7 +81,7 @@ def random_content(
                     grid=grid,
                     cell_offsets=np.concatenate([[0], np.cumsum(counts)]),
                     cell_log_mass=np.where(counts > 0, rng.normal(size=len(counts)), -np.inf),
-                    mixture=random_mixture(rng, int(counts.sum())),
+                    mixture=random_mixture(rng, int(counts.sum()), walls=walls),
                     log_balance=rng.normal(size=int(counts.sum()) * (not levels)).astype(np.float32),  # the first only
                 )
             )
@@ -78,6 +91,8 @@ def random_content(
                 levels=tuple(levels),
                 lost_ray_share=rng.random(),
                 coverage=tuple(rng.random(3).tolist()),
+                wall_coverage=(0.25, 0.5) if walls else (),
+                cut_power_share=0.125 if walls else 0.0,
             )
         )
     return Content(
@@ -95,6 +110,7 @@ def random_content(
             materials=("itu_concrete", "itu_metal"),
             free_space=FreeSpace(origin=rng.normal(size=3), voxel_size=0.1, free=rng.random((3, 4, 2)) < 0.5),
             sha256=f"{seed:064x}",
+            face_thickness=np.where(np.arange(num_faces) % 2, 0.125, np.nan) if walls else None,
         ),
         parts=tuple(parts),
     )
