@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from rayfix_offline.build import BuildSummary
     from rayfix_offline.check import Check
 
+MOST_WALLS = 6
+"""Columns of the summary of a build for numbers of walls."""
+
 
 def print_evaluation(results: Mapping[str, Any], page: Path) -> None:
     """Print the main results of an evaluation and the path of its report."""
@@ -91,6 +94,8 @@ def print_build_summary(summary: "BuildSummary") -> None:
     )
     console = Console()
     console.print(grid)
+    if any(s.wall_coverage for s in summary.stations):
+        console.print(_wall_grid(summary))
     for s in summary.stations:
         if s.origin == "updated":
             kept = _kept(s.num_kept_cells, s.num_finest_cells, s.largest_change)
@@ -101,6 +106,31 @@ def print_build_summary(summary: "BuildSummary") -> None:
         highlight=False,
         soft_wrap=True,
     )
+
+
+def _wall_grid(summary: "BuildSummary") -> Grid:
+    """Tabulate how far straight paths through walls reach."""
+    grid = Grid(
+        "station",
+        title="Straight paths through walls",
+        title_justify="left",
+        caption_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 0, 0, 1),
+        pad_edge=False,
+    )
+    most = max(len(s.wall_coverage) for s in summary.stations)
+    for k in range(min(most, MOST_WALLS)):
+        grid.add_column(f"<= {k}", justify="right")
+    grid.add_column("cut off", justify="right")
+    for s in summary.stations:
+        shares = [f"{share:.0%}" for share in s.wall_coverage[:MOST_WALLS]]
+        grid.add_row(s.station_id, *shares, *[""] * (min(most, MOST_WALLS) - len(shares)), f"{s.cut_power_share:.2%}")
+    grid.caption = (
+        "<= k: fraction of the free space that straight paths through at most k walls reach, 0 being line of sight; "
+        "cut off: power whose rays ended for weakness"
+    )
+    return grid
 
 
 def _kept(num_kept: int, num_cells: int, largest_change: float) -> str:
@@ -127,6 +157,8 @@ def table_info(table: Table) -> dict[str, Any]:
                 "position_m": list(part.station.position),
                 "lost_ray_share": part.lost_ray_share,
                 "coverage": list(part.coverage),
+                "wall_coverage": list(part.wall_coverage),
+                "cut_power_share": part.cut_power_share,
                 "update": _update_info(part.update),
                 "levels": [
                     {

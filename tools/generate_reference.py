@@ -59,6 +59,7 @@ SECTIONS = (
     ("SiteSection", "[site]", "The scene and how to read it."),
     ("RoomSection", "[room]", "An empty room in place of a scene file. Stations may stand on its walls: they are moved off by a millimetre, and `rayfix check` says so."),
     ("PropagationSection", "[propagation]", "The paths, and which of them a station reports; the whole section may be left out."),
+    ("MaterialSection", "[materials.NAME]", "NAME is what the scene file calls the material; [Walls](scenes.md#walls)."),
     ("TableSection", "[table]", "Windows and fit of the table; the whole section may be left out."),
     ("StationSection", "[[stations]]", "One section for each base station, anchor or locator. [Mounting](mounting.md) draws its angles."),
     ("BiasSection", "bias of a station", "Measured minus true; the fusion takes it off. [Measurements](measurements.md#bias-of-a-station)."),
@@ -105,6 +106,8 @@ def site_page() -> str:
 
 
 def _unit(key: str) -> str:
+    if key.endswith("_s_m"):
+        return "S/m"
     return UNITS.get(key.rpartition("_")[2], "") if "_" in key else ""
 
 

@@ -36,7 +36,7 @@ def main() -> None:
 def measure(table: Table, count: int, seed: int) -> None:
     drops = drop_uniformly(table, count, np.random.default_rng([seed, 0]))
     heard = Counter(len(drop.paths) for drop in drops)
-    direct = sum(int(p.num_reflections.min() == 0) for drop in drops for p in drop.paths.values())
+    direct = sum(int(p.line_of_sight.any()) for drop in drops for p in drop.paths.values())
     pairs = len(drops) * len(table.site.stations)
     print(f"{count} drops, seed {seed}; stations that hear a drop: {dict(sorted(heard.items()))}")
     print(f"line of sight in {direct / pairs:.0%} of the pairs of drop and station")

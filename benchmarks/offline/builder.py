@@ -34,7 +34,7 @@ from rayfix_offline.rays.pieces import cut_pieces
 from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments
 from rayfix_offline.rays.settings import RaySettings
-from rayfix_offline.rays.trace import LevelRays, StationTrace, level_grid, reflectivity_of, trace_station
+from rayfix_offline.rays.trace import LevelRays, StationTrace, level_grid, scene_walls, trace_station
 from rayfix_offline.scene.engine import RayEngine
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin.twin import Twin, prepare_twin
@@ -95,7 +95,7 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
             rays.directions,
             engine=engine,
             planes=twin.planes,
-            reflectivity=reflectivity_of(site, twin),
+            walls=scene_walls(site, twin),
             bounds=twin.scene.bounds,
             max_reflections=propagation.max_reflections,
             max_path_length=propagation.max_path_length_m,
@@ -110,7 +110,13 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
     bare = median_seconds(lambda: [scene.run(*query) for query in recorder.queries])
     del mesh
     stage = median_seconds(run_stage)
-    prior = fill_path_prior(rays, segments, twin.free_space, exponent=exponent, refinement=RaySettings.prior_refinement)
+    prior = fill_path_prior(
+        rays,
+        segments,
+        twin.free_space,
+        exponent=exponent,
+        refinement=RaySettings.prior_refinement,
+    )
     print(
         f"rays: {len(rays)} with up to {propagation.max_reflections} reflections, {num_segments} segments\n"
         f"  ray stage          {num_segments / stage / 1e6:6.2f} million rays/s\n"
@@ -121,7 +127,11 @@ def measure_rays(site: SiteFile, twin: Twin) -> dict[str, float]:
         "rays": stage,
         "path prior": median_seconds(
             lambda: fill_path_prior(
-                rays, segments, twin.free_space, exponent=exponent, refinement=RaySettings.prior_refinement
+                rays,
+                segments,
+                twin.free_space,
+                exponent=exponent,
+                refinement=RaySettings.prior_refinement,
             )
         ),
         "pieces": median_seconds(

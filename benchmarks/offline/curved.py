@@ -132,11 +132,11 @@ def measure(level: LevelRays, cells: NDArray[np.int64], points: list[NDArray[np.
     gathered = gathered_rays(level.rays, level.pieces, sequences)
     groups, kept = [], []
     for centre in centres:
-        seq, slices, mass, mean, cov = gather_groups(
+        seq, slices, walls, mass, mean, cov = gather_groups(
             *centre, level.window, fit.cutoff, gathered, level.pieces.num_slices, new_rows(len(sequences.images))
         )
         surface = level.surface_sequences[seq]
-        mass = join_groups(surface, slices, mass, mean, cov, sequences.mirrors[seq])[1]
+        mass = join_groups(surface, slices, mass, mean, cov, sequences.mirrors[seq], walls)[1]
         groups.append(len(mass))
         kept.append(np.sort(mass)[::-1][: fit.max_groups].sum() / mass.sum())
     begin = time.process_time()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from benchmarks.common.warehouse import write_warehouse
 from rayfix.example.files import write_example
 from rayfix_evaluation.truth.forward import ForwardSolver
-from rayfix_offline.rays.pathprior import PathPrior, fill_path_prior, reflection_factors
+from rayfix_offline.rays.pathprior import PathPrior, fill_path_prior, wall_factors
 from rayfix_offline.rays.trace import launch_rays
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin.twin import Twin, prepare_twin
@@ -80,15 +80,14 @@ def draw_places(site: SiteFile, twin: Twin, count: int, rng: np.random.Generator
         reflection_loss_db=site.propagation.reflection_loss_db,
     )
     station = solver.station(np.array(site.stations[0].position_m))
-    volume = np.where(segments.sequence >= 0, segments.end**3 - segments.start**3, 0.0)
-    chosen = rng.choice(volume.size, count, p=(volume / volume.sum()).ravel())
-    ray, depth = np.unravel_index(chosen, volume.shape)
-    start, end = segments.start[ray, depth], segments.end[ray, depth]
+    volume = segments.end**3 - segments.start**3
+    chosen = rng.choice(len(volume), count, p=volume / volume.sum())
+    ray, start, end = segments.ray[chosen], segments.start[chosen], segments.end[chosen]
     length = np.cbrt(start**3 + rng.random(count) * (end**3 - start**3))
-    sequence = segments.sequence[ray, depth]
+    sequence = segments.sequence[chosen]
     heading = np.einsum("nij,nj->ni", segments.sequences.mirrors[sequence], rays.directions[ray])
     position = segments.sequences.images[sequence] + length[:, None] * heading
-    own = reflection_factors(segments, exponent)[ray, depth] * length ** (-2.0 * exponent)
+    own = wall_factors(segments, exponent)[chosen] * length ** (-2.0 * exponent)
     total = np.array([np.sum(10.0 ** (0.1 * exponent * station.paths(place).gain_db)) for place in position])
     inside = twin.free_space.contains(position)
     return Places(position=position[inside], own=own[inside], total=np.maximum(total, own)[inside])

@@ -94,6 +94,7 @@ def pieces(position: NDArray[np.float64], centres: NDArray[np.float64], window: 
         jacobian=np.stack([along, length[:, None] * across, length[:, None] * down], axis=-1).astype(np.float32),
         x_cov=pack(np.tile(1e-4 * np.eye(3), (count, 1, 1))).astype(np.float32),
         num_reflections=np.zeros(count, np.int8),
+        num_walls=np.zeros(count, np.int8),
     )
 
 

@@ -71,6 +71,8 @@ class StationSummary:
     num_bytes: int
     lost_ray_share: float
     coverage: tuple[float, ...]
+    wall_coverage: tuple[float, ...]
+    cut_power_share: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,6 +292,7 @@ def _scene_of(twin: Twin) -> Scene:
         materials=twin.scene.materials,
         free_space=twin.free_space,
         sha256=twin.scene.sha256,
+        face_thickness=twin.scene.face_thickness,
     ).moved(twin.origin)
 
 
@@ -308,6 +311,8 @@ def _summary(station_id: str, built: BuiltStation) -> StationSummary:
         num_bytes=part.num_bytes,
         lost_ray_share=part.lost_ray_share,
         coverage=part.coverage,
+        wall_coverage=part.wall_coverage,
+        cut_power_share=part.cut_power_share,
     )
 
 

@@ -96,6 +96,16 @@ class PropagationSection(Section):
         description="loss of each reflection; with itu, for materials without a known name",
         json_schema_extra={"effect": "time and size stay the same"},
     )
+    transmission: bool = Field(
+        default=True,
+        description="whether walls of known material and thickness let signals through",
+        json_schema_extra={"effect": "time and size grow where walls let signals through: see Walls"},
+    )
+    excess_length: bool = Field(
+        default=True,
+        description="whether a wall that a path passes adds to its measured length, as a slab of its permittivity does",
+        json_schema_extra={"effect": "time and size stay the same"},
+    )
     path_prior: Literal["power", "uniform", "paper"] = Field(
         default="power",
         description="path-selection prior: strong paths preferred, any path alike, or as in the paper",
@@ -108,6 +118,40 @@ class PropagationSection(Section):
         description="exponent of the path gain in the path-selection prior; a larger one prefers strong paths more",
         json_schema_extra={"effect": "time and size stay the same"},
     )
+
+
+class MaterialSection(Section):
+    """``[materials.NAME]``: a material of the scene, by the name that the scene file gives it."""
+
+    itu: str | None = Field(
+        default=None,
+        description="material of ITU-R P.2040, e.g. plasterboard; NAME itself unless given",
+    )
+    permittivity: Annotated[float, Field(ge=1, le=1000)] | None = Field(
+        default=None, description="real part of the relative permittivity, instead of itu"
+    )
+    conductivity_s_m: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
+        default=None, description="conductivity, with permittivity; 0 unless given"
+    )
+    reflection_loss_db: Annotated[float, Field(ge=0, le=200)] | None = Field(
+        default=None, description="loss of each reflection, instead of the computed one"
+    )
+    transmission_loss_db: Annotated[float, Field(ge=0, le=200)] | None = Field(
+        default=None, description="loss of each passage through a wall, instead of the computed one"
+    )
+    thickness_m: Annotated[float, Field(gt=0, le=100)] | None = Field(
+        default=None,
+        description="thickness of sheets; a closed solid has its own, but lets signals through only with this key",
+        json_schema_extra={"effect": "time and size grow where walls let signals through: see Walls"},
+    )
+
+    @model_validator(mode="after")
+    def _made_of_one(self) -> "MaterialSection":
+        if self.itu is not None and self.permittivity is not None:
+            raise ValueError("itu and permittivity both state the material; give one of them")
+        if self.conductivity_s_m is not None and self.permittivity is None:
+            raise ValueError("conductivity_s_m needs permittivity; add it, or give itu instead")
+        return self
 
 
 class TableSection(Section):
@@ -278,6 +322,7 @@ class SiteFile(Section):
     room: RoomSection | None = None
     propagation: PropagationSection = PropagationSection()
     table: TableSection = TableSection()
+    materials: dict[Annotated[str, Field(min_length=1)], MaterialSection] = Field(default_factory=dict)
     stations: tuple[StationSection, ...]
 
     @model_validator(mode="after")
@@ -414,6 +459,7 @@ def _known_keys(location: tuple[str | int, ...]) -> list[str]:
         "room": RoomSection,
         "propagation": PropagationSection,
         "table": TableSection,
+        "materials": MaterialSection,
         "stations": StationSection,
         "bias": BiasSection,
         "angles": AngleBiasSection,

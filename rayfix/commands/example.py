@@ -1,4 +1,4 @@
-"""The bundled hall: ``rayfix demo`` and ``rayfix example``."""
+"""The bundled examples: ``rayfix demo`` and ``rayfix example``."""
 
 import argparse
 from pathlib import Path
@@ -14,7 +14,14 @@ def add_commands(add: AddCommand) -> None:
     demo.add_argument("-o", "--output", type=Path, default=Path("demo"), metavar="DIR", help="folder (default: demo)")
     add_jobs_argument(demo, "cells fitted at a time")
 
-    example = add("example", _example, "write the bundled hall: hall.glb, site.toml, report.json")
+    example = add("example", _example, "write a bundled example: its scene (glb), site.toml, report.json")
+    example.add_argument(
+        "example",
+        nargs="?",
+        choices=("hall", "office"),
+        default="hall",
+        help="a hall full of machines (default), or an office whose walls let signals through",
+    )
     example.add_argument("folder", type=Path, metavar="DIR", help="folder, created if necessary")
 
 
@@ -29,8 +36,7 @@ def _example(options: argparse.Namespace) -> int:
     with needs_extra("offline"):
         from rayfix.example.files import write_example
 
-        site = write_example(options.folder)
-    print(
-        f"Wrote {site} with its scene and a report. Next: {own_command()} build {site} -o {options.folder / 'hall.h5'}"
-    )
+        site = write_example(options.folder, example=options.example)
+    table = options.folder / f"{options.example}.h5"
+    print(f"Wrote {site} with its scene and a report. Next: {own_command()} build {site} -o {table}")
     return 0

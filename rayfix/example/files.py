@@ -1,18 +1,33 @@
-"""Write the files of the bundled example."""
+"""Write the files of the bundled examples: the hall and the office."""
 
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 from rayfix.example.hall import hall_scene
+from rayfix.example.office import office_scene
 from rayfix_tables.errors import RayfixError
 
+if TYPE_CHECKING:
+    import trimesh
+
 SCENE_FILE, SITE_FILE, REPORT_FILE = "hall.glb", "site.toml", "report.json"
+
+Example = Literal["hall", "office"]
+
+SCENES: dict[Example, "Callable[[], trimesh.Scene]"] = {"hall": hall_scene, "office": office_scene}
+
+_FILES: dict[Example, tuple[str, str]] = {"hall": (SITE_FILE, REPORT_FILE), "office": ("office.toml", "office.json")}
+"""Bundled files with the site and a report."""
 
 _WINDOWS = "windows_deg = [1.25, 5, 15]"
 
 
-def write_example(folder: str | Path, *, windows_deg: tuple[float, ...] = (1.25, 5.0, 15.0)) -> Path:
-    """Write the hall's scene, its site file and a report into a folder, which is created if needed.
+def write_example(
+    folder: str | Path, *, windows_deg: tuple[float, ...] = (1.25, 5.0, 15.0), example: Example = "hall"
+) -> Path:
+    """Write an example's scene, its site file and a report into a folder, which is created if needed.
 
     Returns
     -------
@@ -26,9 +41,9 @@ def write_example(folder: str | Path, *, windows_deg: tuple[float, ...] = (1.25,
     """
     folder = Path(folder)
     files = {
-        folder / SCENE_FILE: hall_scene().export(file_type="glb"),
-        folder / SITE_FILE: _site_text(windows_deg).encode(),
-        folder / REPORT_FILE: example_report().encode(),
+        folder / f"{example}.glb": SCENES[example]().export(file_type="glb"),
+        folder / SITE_FILE: _site_text(windows_deg, example).encode(),
+        folder / REPORT_FILE: example_report(example).encode(),
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -42,12 +57,16 @@ def write_example(folder: str | Path, *, windows_deg: tuple[float, ...] = (1.25,
     return folder / SITE_FILE
 
 
-def example_report() -> str:
-    """JSON of the bundled report, as ``POST /v1/positions`` takes it."""
-    return resources.files("rayfix.example").joinpath(REPORT_FILE).read_text(encoding="utf-8")
+def example_report(example: Example = "hall") -> str:
+    """JSON of a bundled report, as ``POST /v1/positions`` takes it."""
+    return _bundled(_FILES[example][1])
 
 
-def _site_text(windows_deg: tuple[float, ...]) -> str:
-    text = resources.files("rayfix.example").joinpath(SITE_FILE).read_text(encoding="utf-8")
+def _bundled(name: str) -> str:
+    return resources.files("rayfix.example").joinpath(name).read_text(encoding="utf-8")
+
+
+def _site_text(windows_deg: tuple[float, ...], example: Example) -> str:
+    text = _bundled(_FILES[example][0])
     assert text.count(_WINDOWS) == 1
     return text.replace(_WINDOWS, f"windows_deg = [{', '.join(f'{w:g}' for w in windows_deg)}]")

@@ -30,11 +30,12 @@ FIELD_SHAPES: dict[str, tuple[int, ...]] = {
     "jacobian": (3, 3),
     "x_cov": (6,),
     "num_reflections": (),
+    "num_walls": (),
 }
 """Shape of one component's entry in each field; symmetric matrices are packed by :func:`pack`."""
 
 FIELD_DTYPES: dict[str, type[np.generic]] = {
-    name: (np.int8 if name == "num_reflections" else np.float32) for name in FIELD_SHAPES
+    name: (np.int8 if name.startswith("num_") else np.float32) for name in FIELD_SHAPES
 }
 """Type of each field on disk."""
 
@@ -104,6 +105,8 @@ class TubeMixture:
         Packed covariance of x given u, in addition to the widening.
     num_reflections : ndarray of int8, shape (n,)
         Reflections of the path that carries most of the component.
+    num_walls : ndarray of int8, shape (n,)
+        Walls that this path passes.
     """
 
     log_weight: NDArray[Any]
@@ -113,6 +116,7 @@ class TubeMixture:
     jacobian: NDArray[Any]
     x_cov: NDArray[Any]
     num_reflections: NDArray[Any]
+    num_walls: NDArray[Any]
 
     def __len__(self) -> int:
         """Return the number of components."""

@@ -54,7 +54,12 @@ class StationPart:
     lost_ray_share : float
         Fraction of the launched rays that left the scene before their last reflection.
     coverage : tuple of float
-        Fraction of the free space that is reached with at most 0, 1, 2, ... reflections.
+        Fraction of the free space that is reached with at most 0, 1, 2, ... reflections, through walls or not.
+    wall_coverage : tuple of float
+        Fraction of the free space that straight paths through at most 0, 1, 2, ... walls reach; empty where no wall
+        lets signals through.
+    cut_power_share : float
+        Fraction of the launched power whose rays ended because they were too weak or had passed too many walls.
     part_id : str
         Hash of everything that determines the part's content; a later build compares it to decide whether to reuse the
         part.
@@ -69,6 +74,8 @@ class StationPart:
     lost_ray_share: float
     coverage: tuple[float, ...]
     part_id: str = ""
+    wall_coverage: tuple[float, ...] = ()
+    cut_power_share: float = 0.0
     update: Update | None = None
     paths: PathMap | None = None
 

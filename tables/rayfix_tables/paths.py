@@ -11,6 +11,8 @@ PATH_FIELDS: dict[str, tuple[type[np.generic], int]] = {
     "offsets": (np.int64, 1),
     "sequence": (np.int32, 1),
     "weight": (np.float32, 1),
+    "excess": (np.float32, 1),
+    "num_walls": (np.int8, 1),
     "images": (np.float64, 2),
     "mirrors": (np.float64, 3),
     "num_reflections": (np.int8, 1),
@@ -38,6 +40,10 @@ class PathMap:
     weight : ndarray of float32, shape (n_paths,)
         Positive. With the path prior "power", it is the probability that the station reports this path, and those of a
         voxel add up to 1.
+    excess : ndarray of float32, shape (n_paths,) or (0,), m
+        What the walls that a path passes add to its measured length; empty where no path passes any.
+    num_walls : ndarray of int8, shape (n_paths,) or (0,)
+        Walls that a path passes, the mean over the voxel.
     images : ndarray of float64, shape (n_sequences, 3), m
         Mirror images of the station.
     mirrors : ndarray of float64, shape (n_sequences, 3, 3)
@@ -51,6 +57,8 @@ class PathMap:
     offsets: NDArray[np.int64]
     sequence: NDArray[np.int32]
     weight: NDArray[np.float32]
+    excess: NDArray[np.float32]
+    num_walls: NDArray[np.int8]
     images: NDArray[np.float64]
     mirrors: NDArray[np.float64]
     num_reflections: NDArray[np.int8]

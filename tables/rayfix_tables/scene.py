@@ -25,6 +25,8 @@ class Scene:
     origin : ndarray of shape (3,), m
         Origin of the table's frame in the scene frame; all positions in the file are relative to it. It is zero except
         for scenes on map coordinates, which single precision would resolve to decimetres only.
+    face_thickness : ndarray of shape (n_faces,), optional, m
+        Thickness that the scene file states of each triangle's material, NaN for none; None if it states none.
     """
 
     vertices: NDArray[np.float64]
@@ -34,6 +36,7 @@ class Scene:
     free_space: FreeSpace
     sha256: str
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    face_thickness: NDArray[np.float64] | None = None
 
     def moved(self, by: NDArray[np.float64]) -> "Scene":
         """Return the scene translated by a vector of shape (3,), m, together with the table's frame."""

@@ -127,6 +127,8 @@ class Table:
                 levels=levels,
                 lost_ray_share=_finite(attributes["lost_ray_share"]),
                 coverage=_row(attributes["coverage"]),
+                wall_coverage=_row(attributes.get("wall_coverage", ())),
+                cut_power_share=_finite(attributes.get("cut_power_share", 0.0)),
                 part_id=_text(attributes["part_id"]),
                 update=_read_update(station_id, layout, levels, mapped),
                 paths=_read_paths(station_id, layout, mapped, scene.free_space),
@@ -216,6 +218,11 @@ def _read_level(path: str, layout: FileLayout, mapped: NDArray[np.uint8]) -> Lev
     offsets = arrays["cell_offsets"]
     check_rings(f"{path}/ring_cells", arrays["ring_cells"], len(offsets) - 1)
     grid = AngularGrid(ring_cells=np.array(arrays["ring_cells"]))
+    length = len(arrays["log_weight"])
+    has_walls = f"{path}/num_walls" in layout.datasets
+    arrays["num_walls"] = (
+        layout.array(f"{path}/num_walls", mapped) if has_walls else np.broadcast_to(np.int8(0), length)
+    )
     mixture = TubeMixture(**{name: arrays[name] for name in FIELD_SHAPES})
     shapes = {name: (len(mixture), *shape) for name, shape in FIELD_SHAPES.items()}
     shapes |= {"cell_offsets": (grid.num_cells + 1,), "cell_log_mass": (grid.num_cells,)}
@@ -275,6 +282,8 @@ def _read_paths(
     shapes: dict[str, tuple[int, ...]] = {
         "offsets": (math.prod(shape) + 1,),
         "weight": (count,),
+        "excess": (len(arrays["excess"]) and count,),
+        "num_walls": (len(arrays["excess"]) and count,),
         "images": (num_sequences, 3),
         "mirrors": (num_sequences, 3, 3),
         "num_reflections": (num_sequences,),
@@ -307,6 +316,12 @@ def _read_scene(layout: FileLayout, mapped: NDArray[np.uint8]) -> Scene:
     check_range("scene/faces", faces, 0, len(vertices) - 1)
     check_range("scene/face_materials", face_materials, -1, len(materials) - 1)
     check_range("scene/free_space", free, 0, 1)
+    thickness = None
+    if "scene/face_thickness_m" in layout.datasets:
+        stored = layout.array("scene/face_thickness_m", mapped)
+        if len(stored) != len(faces) or np.any(stored < 0.0):
+            raise ValueError("scene/face_thickness_m does not have one thickness for each face")
+        thickness = np.where(stored > 0.0, stored, np.nan)
     free_space = layout.attributes["scene/free_space"]
     origin = np.array(_triple(layout.attributes["scene"].get("origin_m", (0.0, 0.0, 0.0))))
     in_table_frame = Scene(
@@ -320,6 +335,7 @@ def _read_scene(layout: FileLayout, mapped: NDArray[np.uint8]) -> Scene:
             free=free.view(np.bool_),
         ),
         sha256=_text(layout.attributes[""]["scene_sha256"]),
+        face_thickness=thickness,
     )
     return in_table_frame.moved(origin)
 

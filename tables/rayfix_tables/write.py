@@ -229,6 +229,9 @@ def _write_part(file: h5py.File, part: StationPart, origin: NDArray[np.float64])
     write_text(group, "part_id", part.part_id)
     group.attrs["lost_ray_share"] = part.lost_ray_share
     group.attrs["coverage"] = np.asarray(part.coverage)
+    if part.wall_coverage:
+        group.attrs["wall_coverage"] = np.asarray(part.wall_coverage)
+        group.attrs["cut_power_share"] = part.cut_power_share
     for n, level in enumerate(part.levels):
         _write_level(file.create_group(level_path(station.id, n)), level)
     if part.update is not None:
@@ -246,6 +249,8 @@ def _write_scene(file: h5py.File, scene: Scene) -> None:
     _write(group, "vertices_m", scene.vertices.astype(np.float64))
     _write(group, "faces", scene.faces.astype(np.int32))
     _write(group, "face_materials", scene.face_materials.astype(np.int16))
+    if scene.face_thickness is not None:
+        _write(group, "face_thickness_m", np.nan_to_num(scene.face_thickness))
     free_space = _write(group, "free_space", scene.free_space.free.astype(np.uint8))
     free_space.attrs["origin_m"] = scene.free_space.origin
     free_space.attrs["voxel_size_m"] = scene.free_space.voxel_size
@@ -258,7 +263,8 @@ def _write_level(group: h5py.Group, level: Level) -> None:
     _write(group, "cell_log_mass", level.cell_log_mass.astype(np.float64))
     stored = level.mixture.as_stored()
     for name in FIELD_SHAPES:
-        _write(group, name, getattr(stored, name))
+        if name != "num_walls" or stored.num_walls.any():
+            _write(group, name, getattr(stored, name))
     if len(level.log_balance):
         _write(group, "log_balance", level.log_balance.astype(np.float32))
 

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from rayfix_offline.rays.launch import launch
 from rayfix_offline.rays.segments import Segments
 from rayfix_offline.scene.engine import EmbreeEngine
-from rayfix_offline.scene.materials import Reflectivity, constant_reflectivity
+from rayfix_offline.scene.walls import Walls, opaque_walls
 from rayfix_offline.twin.planes import merge_coplanar
+from tests.support.oracles.rays import Rows
 from tests.support.scenes.rooms import CABINET, ROOM, TABLE, scene_of_boxes
 from tests.support.scenes.shapes import box
 
@@ -42,7 +43,7 @@ def launch_in() -> Callable[..., Segments]:
         max_reflections: int = 3,
         max_path_length: float = 1000.0,
         loss_db: float = 6.0,
-        reflectivity: Reflectivity | None = None,
+        walls: Walls | None = None,
     ) -> Segments:
         corners = triangles.reshape(-1, 3)
         return launch(
@@ -50,11 +51,21 @@ def launch_in() -> Callable[..., Segments]:
             directions,
             engine=EmbreeEngine(triangles),
             planes=merge_coplanar(triangles),
-            reflectivity=reflectivity or constant_reflectivity(len(triangles), loss_db=loss_db),
+            walls=walls or opaque_walls(len(triangles), loss_db=loss_db),
             bounds=np.stack([corners.min(axis=0), corners.max(axis=0)]),
             max_reflections=max_reflections,
             max_path_length=max_path_length,
         )
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def launch_rows(launch_in: Callable[..., Segments]) -> Callable[..., Rows]:
+    """Return a function that launches rays among opaque triangles, one row for each."""
+
+    def run(*args: Any, **options: Any) -> Rows:
+        return Rows.of(launch_in(*args, **options))
 
     return run
 
@@ -95,7 +106,7 @@ def site_document() -> Callable[..., dict[str, Any]]:
             "stations": [{"id": "bs1", "position_m": [3.6, 0.4, 2.6]}],
         }
         for name, section in sections.items():
-            document[name] = {**document[name], **section} if isinstance(section, dict) else section
+            document[name] = {**document.get(name, {}), **section} if isinstance(section, dict) else section
         return document
 
     return make
@@ -105,9 +116,13 @@ def as_toml(document: dict[str, Any]) -> str:
     """Write a site document as TOML; its strings, numbers and lists look alike in both."""
 
     def entries(section: dict[str, Any]) -> str:
-        return "".join(f"{key} = {value!r}\n" for key, value in section.items())
+        return "".join(
+            f"{key} = {str(value).lower() if isinstance(value, bool) else repr(value)}\n"
+            for key, value in section.items()
+        )
 
     text = "".join(f"[{name}]\n{entries(document[name])}" for name in ("site", "propagation", "table"))
+    text += "".join(f"[materials.{name}]\n{entries(each)}" for name, each in document.get("materials", {}).items())
     return text + "".join(f"[[stations]]\n{entries(station)}" for station in document["stations"])
 
 

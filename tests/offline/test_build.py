@@ -70,6 +70,57 @@ def test_the_table_is_whole(table_path: Path, site_path: Path) -> None:
             assert np.all((points > -0.05) & (points < np.array([4.05, 5.05, 3.05])))
 
 
+def test_a_screen_of_glass_is_passed(tmp_path: Path, write_site: WriteSite) -> None:
+    """Half of the room lies behind a screen; opaque, it hides it, and of glass it is a wall that paths pass."""
+    scene = trimesh.Scene()
+    for name, bounds in {"room": [(0, 0, 0), (4, 5, 3)], "screen": [(1.98, 0.0, 0.0), (2.02, 5.0, 3.0)]}.items():
+        mesh = trimesh.creation.box(bounds=bounds)
+        if name == "room":
+            mesh.invert()
+        mesh.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(name=name))
+        scene.add_geometry(mesh, geom_name=name, node_name=name)
+    glass = {"screen": {"itu": "glass", "thickness_m": 0.04}}
+    tables = {}
+    for name, materials, propagation in (
+        ("opaque", {}, {}),
+        ("glass", glass, {}),
+        ("no excess", glass, {"excess_length": False}),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        site = write_site(
+            folder, scene=scene, table={"windows_deg": [15.0]}, materials=materials, propagation=propagation
+        )
+        build_table(site, folder / "t.h5", jobs=1)
+        tables[name] = Table.open(folder / "t.h5")
+    (opaque,), (part,), (plain,) = (tuple(table.parts.values()) for table in tables.values())
+    assert (tables["opaque"].format_version, tables["glass"].format_version) == (2, 3)
+    assert (opaque.wall_coverage, opaque.cut_power_share) == ((), 0.0)
+    assert opaque.coverage[-1] == pytest.approx(0.5, abs=0.02)
+    assert part.coverage == pytest.approx((1.0, 1.0), abs=0.02)
+    assert part.wall_coverage[:2] == pytest.approx((0.5, 1.0), abs=0.02)
+    mixture = part.levels[0].mixture
+    here = mixture.x_mean[:, 0] > 2.1  # the station is there
+    assert np.all(opaque.levels[0].mixture.x_mean[:, 0] > 1.9)
+    direct = mixture.num_reflections == 0
+    assert set(mixture.num_walls[here & direct].tolist()) == {0}
+    beyond = (mixture.x_mean[:, 0] < 1.8) & direct
+    assert np.count_nonzero(beyond) > 20
+    assert set(mixture.num_walls[beyond].tolist()) == {1}
+    # Behind the screen measured lengths are longer by what the slab adds, which grows from normal to grazing incidence.
+    lengths = []
+    for each in (part, plain):
+        tubes = each.levels[0].mixture
+        behind = (tubes.x_mean[:, 0] < 1.8) & (tubes.num_reflections == 0)
+        way = np.linalg.norm(tubes.x_mean[behind] - each.station.position, axis=1)
+        lengths.append(float(np.mean(tubes.u_mean[behind, 0] - way)))
+    assert 0.04 * (np.sqrt(6.31) - 1.0) < lengths[0] - lengths[1] < 0.04 * np.sqrt(5.31)
+    # Another thickness is another part.
+    site.write_text(site.read_text(encoding="utf-8").replace("0.04", "0.05"), encoding="utf-8")
+    summary = build_table(site, tmp_path / "glass" / "t.h5", jobs=1)
+    assert [station.origin for station in summary.stations] != ["kept"]
+
+
 @pytest.mark.parametrize(("path_prior", "balances"), [("power", True), ("uniform", False), ("paper", False)])
 def test_levels_are_balanced_where_the_paths_to_a_place_have_probabilities(
     tmp_path: Path, write_site: WriteSite, path_prior: str, balances: bool

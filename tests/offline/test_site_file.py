@@ -34,10 +34,13 @@ def test_the_shortest_site_has_the_documented_defaults() -> None:
             "max_path_length_m": 60.0,
             "reflection": "constant",
             "reflection_loss_db": 6.0,
+            "transmission": True,
+            "excess_length": True,
             "path_prior": "power",
             "path_prior_exponent": 2.0,
         },
         "table": {"windows_deg": [1.25, 5.0, 15.0], "fit": "tubes", "seed": 1},
+        "materials": {},
         "stations": [
             {
                 "id": "s",
@@ -117,7 +120,7 @@ def test_an_unknown_key_of_a_station(site_document: Document) -> None:
 
 def test_an_unknown_section(site_document: Document) -> None:
     message = refused({**site_document(), "colours": {}})
-    assert message == "unknown key colours; the file knows site, room, propagation, table, stations"
+    assert message == "unknown key colours; the file knows site, room, propagation, table, materials, stations"
 
 
 @pytest.mark.parametrize(("section", "key"), [("site", "name"), ("stations", "id"), ("stations", "position_m")])

@@ -74,7 +74,7 @@ def test_the_command_writes_the_site_and_the_fix(
     assert "2 fixes" in capsys.readouterr().out
     data = data_of(page.read_text(encoding="utf-8"))
     assert [event["fix"]["target_id"] for event in data["events"]] == [REPORT["target_id"], "second"]
-    assert data["settings"] == {"simulation": False, "max_reflections": 2}
+    assert data["settings"] == {"simulation": False, "max_reflections": 2, "open_materials": []}
     scene = trimesh.load(io.BytesIO(base64.b64decode(data["scene_base64"])), file_type="glb")
     table = Table.open(hall_table_path)
     size = table.scene.vertices.max(axis=0) - table.scene.vertices.min(axis=0)

@@ -16,6 +16,7 @@ def random_mixture(seed: int, count: int) -> TubeMixture:
     rng = np.random.default_rng(seed)
     fields = {name: rng.normal(size=(count, *shape)) for name, shape in FIELD_SHAPES.items()}
     fields["num_reflections"] = rng.integers(0, 9, count).astype(np.int8)
+    fields["num_walls"] = rng.integers(0, 9, count).astype(np.int8)
     return TubeMixture(**fields)
 
 
@@ -76,7 +77,7 @@ def test_stored_types(seed: int, count: int) -> None:
         assert array.shape == (count, *shape)
         assert array.flags.c_contiguous
         np.testing.assert_array_equal(array, getattr(mixture, name).astype(FIELD_DTYPES[name]))
-    assert sum(getattr(stored, name).nbytes for name in FIELD_SHAPES) == count * (28 * 4 + 1)
+    assert sum(getattr(stored, name).nbytes for name in FIELD_SHAPES) == count * (28 * 4 + 2)
 
 
 def test_joint_moments_agree_with_sampling() -> None:
@@ -91,6 +92,7 @@ def test_joint_moments_agree_with_sampling() -> None:
         jacobian=rng.normal(size=(1, 3, 3)),
         x_cov=pack((x_root @ x_root.T)[None]),
         num_reflections=np.zeros(1, np.int8),
+        num_walls=np.zeros(1, np.int8),
     )
     d = rng.standard_normal((1_000_000, 3)) @ root.T
     slopes = mixture.jacobian[0]

@@ -4,6 +4,9 @@ Maximum likelihood under Gaussian errors, as in W. H. Foy, "Position-location so
 IEEE Transactions on Aerospace and Electronic Systems AES-12 (1976), which covers angles, ranges and time differences
 alike; solved by a trust region within the scene (scipy.optimize) from the best points of a coarse grid, because ranges
 and time differences have several minima.
+
+The robust variant replaces the squares by Cauchy's loss log(1 + r^2), an M-estimator (P. J. Huber and E. M. Ronchetti,
+"Robust Statistics", 2nd ed., 2009): measurements of reflected paths, many deviations off, then count little.
 """
 
 from collections.abc import Sequence
@@ -45,16 +48,19 @@ class LineOfSight:
     kinds : tuple of {"angles", "ranges", "differences"}
         Measurements that are fitted, with the height if the report has one. Times of arrival are used as differences
         because their clock is unknown.
+    robust : bool
+        Cauchy's loss instead of squares.
     """
 
     site: SiteInfo
     bounds: Array
     kinds: tuple[Kind, ...]
+    robust: bool = False
 
     @property
     def name(self) -> str:
         """Name of the method in tables and figures."""
-        return f"line of sight, {' and '.join(self.kinds)}"
+        return f"{'robust ' if self.robust else ''}line of sight, {' and '.join(self.kinds)}"
 
     def locate(self, report: Report) -> Array | None:
         """Position of shape (3,), m, or None with fewer than three equations.
@@ -69,8 +75,17 @@ class LineOfSight:
             return np.concatenate([term.residuals(point[None])[0] for term in terms])
 
         found = [
-            least_squares(residuals, start, bounds=self.bounds, x_scale="jac", xtol=1e-10, ftol=1e-12, gtol=1e-12)
-            for start in _starts(terms, self.bounds)
+            least_squares(
+                residuals,
+                start,
+                bounds=self.bounds,
+                loss="cauchy" if self.robust else "linear",
+                x_scale="jac",
+                xtol=1e-10,
+                ftol=1e-12,
+                gtol=1e-12,
+            )
+            for start in _starts(terms, self.bounds, robust=self.robust)
         ]
         return np.asarray(min(found, key=lambda result: float(result.cost)).x)
 
@@ -193,12 +208,13 @@ def _terms(report: PaperReport, height: Height | None, site: SiteInfo, kinds: Se
     return terms
 
 
-def _starts(terms: Sequence[_Term], bounds: Array) -> list[Array]:
-    """Points of a coarse grid with the least squares, at a distance from each other."""
+def _starts(terms: Sequence[_Term], bounds: Array, *, robust: bool) -> list[Array]:
+    """Points of a coarse grid with the least loss, at a distance from each other."""
     low, high = bounds
     axes = [low[i] + (np.arange(n) + 0.5) / n * (high[i] - low[i]) for i, n in enumerate(_GRID)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    cost = np.sum([np.square(term.residuals(grid)).sum(axis=1) for term in terms], axis=0)
+    squares = [np.square(term.residuals(grid)) for term in terms]
+    cost = np.sum([(np.log1p(square) if robust else square).sum(axis=1) for square in squares], axis=0)
     apart = _APART * float(np.linalg.norm(high - low))
     starts: list[Array] = []
     for point in grid[np.argsort(cost, kind="stable")]:

@@ -98,12 +98,11 @@ def plane_crossings(launcher: Launcher, station: Array, directions: Array, heigh
         x and y of each crossing; a ray has one for each of its straight segments that crosses the plane.
     """
     segments = launcher.trace(station, directions)
-    ray, depth = np.nonzero(segments.sequence >= 0)
-    sequence = segments.sequence[ray, depth]
+    ray, sequence = segments.ray, segments.sequence
     image = segments.sequences.images[sequence]
     heading = np.einsum("nij,nj->ni", segments.sequences.mirrors[sequence], directions[ray])
     with np.errstate(divide="ignore", invalid="ignore"):
         length = (height - image[:, 2]) / heading[:, 2]
     # A segment within the plane has no crossing: its length is infinite or not a number.
-    crosses = (length >= segments.start[ray, depth]) & (length < segments.end[ray, depth])
+    crosses = (length >= segments.start) & (length < segments.end)
     return np.asarray((image + np.where(crosses, length, 0.0)[:, None] * heading)[crosses, :2])

@@ -97,14 +97,13 @@ class ReverseRays:
         assert zenith is not None
         heading = direction(azimuth, zenith)
         segments = self.launcher.trace(station, heading[None])
-        (pieces,) = np.nonzero(segments.sequence[0] >= 0)
-        sequence = segments.sequence[0, pieces]
+        sequence = segments.sequence
         headings = segments.sequences.mirrors[sequence] @ heading
-        start = segments.start[0, pieces]
+        start = segments.start
         return Polyline(
             start=segments.sequences.images[sequence] + start[:, None] * headings,
             heading=headings,
-            length=np.maximum(segments.end[0, pieces] - start, 0.0),
+            length=np.maximum(segments.end - start, 0.0),
         )
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rayfix_evaluation.drops.bound import position_error_bound
 from rayfix_evaluation.drops.simulate import Noise, Rule, Timing, select_path, simulate_report, uniform_drops
 from rayfix_evaluation.truth.forward import ForwardSolver, Paths
-from rayfix_offline.scene.materials import face_permittivity
+from rayfix_evaluation.truth.scene_walls import walls_of_table
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
@@ -99,16 +99,13 @@ def solver_of(table: Table, vertices: NDArray[np.float64] | None = None) -> Forw
     """
     propagation = table.site.document["propagation"]
     scene = table.scene
-    permittivity = None
-    if propagation.get("reflection") == "itu":  # older tables lack this key
-        permittivity = face_permittivity(scene.face_materials, scene.materials, propagation["carrier_ghz"])
     return ForwardSolver.from_mesh(
         np.array(scene.vertices if vertices is None else vertices),
         np.array(scene.faces),
         max_reflections=propagation["max_reflections"],
         max_path_length=propagation["max_path_length_m"],
         reflection_loss_db=propagation["reflection_loss_db"],
-        face_permittivity=permittivity,
+        walls=walls_of_table(table),
     )
 
 

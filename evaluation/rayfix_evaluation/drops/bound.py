@@ -44,14 +44,16 @@ def path_gradients(paths: Paths, index: int) -> NDArray[np.float64]:
     bounces = int(paths.num_reflections[index])
     vertices = paths.vertices[index, : bounces + 2]
     segments = np.diff(vertices, axis=0)
-    directions = segments / np.linalg.norm(segments, axis=1, keepdims=True)
+    lengths = np.linalg.norm(segments, axis=1, keepdims=True)
+    directions = segments / lengths
     # Product of the reflections from the station's end; it maps a displacement of the point to that of the unfolded
     # point.
     mirrors = np.eye(3)
     for incoming, outgoing in itertools.pairwise(directions):
         normal = (outgoing - incoming) / np.linalg.norm(outgoing - incoming)
         mirrors = mirrors @ (np.eye(3) - 2.0 * np.outer(normal, normal))
-    length = float(paths.path_length[index])
+    # Without what slabs add: it hardly changes with the point, and the angles turn with the distance.
+    length = float(lengths.sum())
     x, y, z = length * directions[0]
     square = x * x + y * y
     horizontal = np.sqrt(square)

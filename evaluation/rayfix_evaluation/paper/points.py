@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_evaluation.truth.scene_walls import scene_walls_of_table
 from rayfix_offline.rays.launch import launch
 from rayfix_offline.rays.segments import Segments
 from rayfix_offline.scene.engine import EmbreeEngine, RayEngine
-from rayfix_offline.scene.materials import Reflectivity, constant_reflectivity
+from rayfix_offline.scene.walls import Walls, opaque_walls
 from rayfix_offline.twin.planes import Planes, merge_coplanar
 from rayfix_service.fusion.measurements.directions import Direction
 from rayfix_tables.geometry.angles import direction
@@ -27,7 +28,7 @@ class RayPoints:
     ----------
     position : ndarray of shape (n, 3), m
     path_length : ndarray of shape (n,), m
-        Length from the station along the reflected ray.
+        Length from the station along the reflected ray, and what the slabs of the walls before it add.
     """
 
     position: NDArray[np.float64]
@@ -48,6 +49,8 @@ class Launcher:
 
     Attributes
     ----------
+    walls : Walls
+        Points have no power: losses only end what is too weak where walls let signals through.
     bounds : ndarray of shape (2, 3), m
         Low and high corner of the scene.
     max_path_length : float, m
@@ -55,7 +58,7 @@ class Launcher:
 
     engine: RayEngine
     planes: Planes
-    reflectivity: Reflectivity
+    walls: Walls
     bounds: NDArray[np.float64]
     max_reflections: int
     max_path_length: float
@@ -66,11 +69,14 @@ class Launcher:
         propagation = table.site.document["propagation"]
         triangles = np.asarray(table.scene.vertices, np.float64)[table.scene.faces]
         corners = triangles.reshape(-1, 3)
+        walls = scene_walls_of_table(table)
+        if walls is None or not walls.passable.any():
+            # The paper's points have no power.
+            walls = opaque_walls(len(triangles), loss_db=0.0)
         return cls(
             engine=EmbreeEngine(triangles),
             planes=merge_coplanar(triangles),
-            # The paper's points have no power.
-            reflectivity=constant_reflectivity(len(triangles), loss_db=0.0),
+            walls=walls,
             bounds=np.stack([corners.min(axis=0), corners.max(axis=0)]),
             max_reflections=int(propagation["max_reflections"]),
             max_path_length=float(propagation["max_path_length_m"]),
@@ -83,7 +89,7 @@ class Launcher:
             directions,
             engine=self.engine,
             planes=self.planes,
-            reflectivity=self.reflectivity,
+            walls=self.walls,
             bounds=self.bounds,
             max_reflections=self.max_reflections,
             max_path_length=self.max_path_length,
@@ -138,14 +144,16 @@ def points_on_rays(
     """
     segments = launcher.trace(station, directions)
     phase = step * rng.random(len(directions))
-    ray, depth = np.nonzero(segments.sequence >= 0)
-    first = np.ceil((segments.start[ray, depth] - phase[ray]) / step).astype(np.int64)
-    last = np.ceil((segments.end[ray, depth] - phase[ray]) / step).astype(np.int64)
+    ray = segments.ray
+    first = np.ceil((segments.start - phase[ray]) / step).astype(np.int64)
+    last = np.ceil((segments.end - phase[ray]) / step).astype(np.int64)
     counts = np.maximum(last - first, 0)
     which = np.repeat(np.arange(len(ray)), counts)
     number = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts) + first[which]
     length = phase[ray[which]] + step * number
-    sequence = segments.sequence[ray, depth][which]
+    sequence = segments.sequence[which]
     images, mirrors = segments.sequences.images, segments.sequences.mirrors
-    heading = np.einsum("nij,nj->ni", mirrors[segments.sequence[ray, depth]], directions[ray])
-    return RayPoints(position=images[sequence] + length[:, None] * heading[which], path_length=length)
+    heading = np.einsum("nij,nj->ni", mirrors[segments.sequence], directions[ray])
+    return RayPoints(
+        position=images[sequence] + length[:, None] * heading[which], path_length=length + segments.excess[which]
+    )

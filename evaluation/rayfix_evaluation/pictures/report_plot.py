@@ -136,13 +136,10 @@ def _draw_rays(
     colour: str,
 ) -> None:
     segments = launcher.trace(station, directions)
-    ray, depth = np.nonzero(segments.sequence >= 0)
-    sequence = segments.sequence[ray, depth]
+    ray, sequence = segments.ray, segments.sequence
     images, mirrors = segments.sequences.images[sequence], segments.sequences.mirrors[sequence]
     heading = np.einsum("nij,nj->ni", mirrors, directions[ray])
-    pieces = np.stack(
-        [images + reach[ray, depth][:, None] * heading for reach in (segments.start, segments.end)], axis=1
-    )
+    pieces = np.stack([images + reach[:, None] * heading for reach in (segments.start, segments.end)], axis=1)
     for axes, view in figure.views:
         axes.add_collection(
             LineCollection(list(pieces[:, :, list(view)]), colors=colour, linewidths=0.5, alpha=0.35, zorder=1.5)

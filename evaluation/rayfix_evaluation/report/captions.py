@@ -46,11 +46,14 @@ def paths_caption(evaluation: "Evaluation") -> str:
     """Caption of the scene."""
     pictures = evaluation.pictures
     stations = pictures["stations"]
-    direct = sum(station["bounces"] == 0 for station in stations)
+    direct = sum(station["bounces"] == 0 and station["walls"] == 0 for station in stations)
+    reflected = sum(station["bounces"] > 0 for station in stations)
+    passed = sum(station["walls"] > 0 for station in stations)
+    through = f", {passed} through walls (squares where they enter)" if passed else ""
     return (
         f"{evaluation.results['site']}: grey triangles are the objects of the twin, coloured lines the paths that "
-        f"{len(stations)} stations report for one transmitter (+): {direct} direct, {len(stations) - direct} "
-        "reflected. The following figures are for this transmitter."
+        f"{len(stations)} stations report for one transmitter (+): {direct} direct, {reflected} reflected{through}. "
+        "The following figures are for this transmitter."
     )
 
 

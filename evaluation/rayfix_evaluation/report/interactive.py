@@ -39,9 +39,13 @@ def space_figure(scene: Backdrop, pictures: Pictures, show: str) -> str:
                     **_xyz(path),
                     mode="lines",
                     line={"color": colour, "width": 4},
-                    name=f"path to {name}, {station['bounces']} reflections",
+                    name=f"path to {name}, {station['bounces']} reflections, {station['walls']} walls",
                 )
             )
+            if station["walls"]:
+                dots = np.array(station["crossings"])
+                marker = {"color": colour, "size": 4, "symbol": "square-open"}
+                traces.append(go.Scatter3d(**_xyz(dots), mode="markers", marker=marker, name="walls", showlegend=False))
         elif show.startswith("points"):
             points = np.array(station[show]).reshape(-1, 3)
             marker = {"color": colour, "size": 2, "opacity": 0.7}

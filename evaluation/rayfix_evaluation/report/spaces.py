@@ -63,6 +63,9 @@ def space_picture(scene: Backdrop, pictures: Pictures, show: str) -> Figure:
         if show == "scene":
             path = placed(station["path"])
             axes.plot(*path.T, color=colour, linewidth=1.3, marker=".", markersize=4)
+            if station["walls"]:
+                dots = placed(station["crossings"])
+                axes.plot(*dots.T, color=colour, linestyle="none", marker="s", markersize=4, fillstyle="none")
         elif show.startswith("points"):
             points = placed(station[show]).reshape(-1, 3)
             axes.plot(*points.T, ".", color=colour, markersize=2.2, alpha=0.6, rasterized=True)

@@ -40,6 +40,7 @@ METHOD_COLOURS = {
     "los-angles": "#e08a1e",
     "los-ranges": "#b9770e",
     "los-differences": "#8d6e63",
+    "los-robust": "#c2580a",
     "fingerprints": "#6b8e23",
 }
 

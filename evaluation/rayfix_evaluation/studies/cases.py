@@ -180,7 +180,7 @@ def in_view(station: Station, paths: Paths) -> Paths:
     """Paths from within a station's field of view."""
     axis = board_to_scene(station)[:, 0]
     cosine = np.clip(direction(paths.azimuth, paths.zenith) @ axis, -1.0, 1.0)
-    return _subset(paths, np.flatnonzero(np.arccos(cosine) <= 0.5 * station.field_of_view))
+    return paths.chosen(np.arccos(cosine) <= 0.5 * station.field_of_view)
 
 
 def _reported(
@@ -192,20 +192,9 @@ def _reported(
         blocked = bool(block_rng.random() < case.blocked)
         left = np.flatnonzero(paths.num_reflections > 0) if blocked else np.arange(len(paths))
         if len(left):
-            usable = _subset(paths, left)
+            usable = paths.chosen(left)
             reported[name] = usable.only(select_path(usable, case.rule, select_rng))
     return reported
-
-
-def _subset(paths: Paths, index: NDArray[np.int64]) -> Paths:
-    return Paths(
-        path_length=paths.path_length[index],
-        azimuth=paths.azimuth[index],
-        zenith=paths.zenith[index],
-        num_reflections=paths.num_reflections[index],
-        gain_db=paths.gain_db[index],
-        vertices=paths.vertices[index],
-    )
 
 
 def _spoil(

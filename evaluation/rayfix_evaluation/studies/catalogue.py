@@ -154,8 +154,8 @@ def _side_by_side(effort: Effort) -> Study:
     )
 
 
-_STRESSED: tuple[str, ...] = ("rayfix", "paper-table", "los-angles")
-"""Methods of the curves: the fast variant of the paper's method, and a classical system."""
+_STRESSED: tuple[str, ...] = ("rayfix", "paper-table", "los-angles", "los-robust")
+"""Methods of the curves: the fast variant of the paper's method, and classical systems, plain and robust."""
 
 
 def _stress(effort: Effort, station_ids: Sequence[str], reflections: int) -> tuple[Study, ...]:

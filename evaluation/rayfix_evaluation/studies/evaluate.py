@@ -208,7 +208,7 @@ class _Runner:
             "heard": heard,
             "unheard": count - len(heard),
             "by_stations": {str(k): int(n) for k, n in enumerate(stations)},
-            "line_of_sight": round(float(np.mean([p.num_reflections.min() == 0 for p in paths])), 4) if paths else 0.0,
+            "line_of_sight": round(float(np.mean([bool(p.line_of_sight.any()) for p in paths])), 4) if paths else 0.0,
             "paths_heard": round(float(np.mean([len(p) for p in paths])), 2) if paths else 0.0,
         }
 

@@ -173,12 +173,12 @@ def _reverse_rays(tools: Tools) -> Answering:
     return _from_reports(ReverseRays.of_table(tools.table("site")).locate)
 
 
-def _line_of_sight(kind: Kind) -> Callable[[Tools], Answering]:
+def _line_of_sight(*kinds: Kind, robust: bool = False) -> Callable[[Tools], Answering]:
     def make(tools: Tools) -> Answering:
         table = tools.table("site")
         vertices = np.asarray(table.scene.vertices, np.float64)
         bounds = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
-        return _from_reports(LineOfSight(site=table.site, bounds=bounds, kinds=(kind,)).locate)
+        return _from_reports(LineOfSight(site=table.site, bounds=bounds, kinds=kinds, robust=robust).locate)
 
     return make
 
@@ -257,6 +257,14 @@ _RIVALS = (
             make=_line_of_sight(kind),
         )
         for kind, text, timings in _STRAIGHT
+    ),
+    Method(
+        key="los-robust",
+        label="robust least squares on all",
+        note="Angles and times together as if every path were the line of sight, with Cauchy's loss: what is many "
+        "deviations off counts little.",
+        weight=8.0,
+        make=_line_of_sight(*(kind for kind, _, _ in _STRAIGHT), robust=True),
     ),
     Method(
         key="fingerprints",

@@ -76,11 +76,14 @@ def draw_pictures(bench: Bench, heard: Sequence[int], seed: int) -> dict[str, An
         flat = fit_mixture(crossings, settings.num_components, int(rng.integers(2**31))) if len(crossings) > 1 else None
         if flat is not None:
             plane.append(flat)
+        path = drop.paths[station.id]
         stations.append(
             {
                 "id": station.id,
-                "path": _rounded(drop.paths[station.id].vertices[0]),
-                "bounces": int(drop.paths[station.id].num_reflections[0]),
+                "path": _rounded(path.vertices[0]),
+                "bounces": int(path.num_reflections[0]),
+                "walls": int(path.num_walls[0]),
+                "crossings": _rounded(path.crossings[0, : int(path.num_walls[0])]),
                 "measured_length": round(length, 4),
                 "rays": [_rounded(corners) for corners in _polylines(launcher, origin, measured, rng)],
                 "points_aoa": _rounded(_some(points.position, _POINTS, rng)),
@@ -106,25 +109,20 @@ def draw_pictures(bench: Bench, heard: Sequence[int], seed: int) -> dict[str, An
 def _choose(bench: Bench, heard: Sequence[int]) -> int:
     def merit(number: int) -> tuple[int, int]:
         paths = bench.drop(World(), number).paths.values()
-        direct = sum(int(p.num_reflections[0] == 0) for p in paths)
+        direct = sum(int(p.line_of_sight[0]) for p in paths)
         return len(paths), -direct if direct else -len(paths)
 
     return max(heard[:_LOOKED_AT], key=merit)
 
 
 def _polylines(launcher: Launcher, origin: Array, measured: Direction, rng: np.random.Generator) -> list[Array]:
-    """Corners of some rays around a measured direction, each of shape (n, 3), m."""
+    """Straight pieces of some rays around a measured direction, each of shape (2, 3), m."""
     directions = draw_directions(measured, _RAYS, rng)
     segments = launcher.trace(origin, directions)
     images, mirrors = segments.sequences.images, segments.sequences.mirrors
-    corners = []
-    for ray, heading in enumerate(directions):
-        found = [origin]
-        for depth in np.flatnonzero(segments.sequence[ray] >= 0):
-            sequence = segments.sequence[ray, depth]
-            found.append(images[sequence] + segments.end[ray, depth] * (mirrors[sequence] @ heading))
-        corners.append(np.array(found))
-    return corners
+    heading = np.einsum("nij,nj->ni", mirrors[segments.sequence], directions[segments.ray])
+    ends = [images[segments.sequence] + at[:, None] * heading for at in (segments.start, segments.end)]
+    return list(np.stack(ends, axis=1))
 
 
 def _differences(clouds: dict[str, RayPoints], ranges: dict[str, tuple[float, float]] | Any) -> dict[str, Any] | None:

@@ -5,8 +5,9 @@ are those of ``docs/conventions.md``.
 
 A path leaves the station, is reflected at up to ``max_reflections`` planes and ends at the point. Coplanar triangles
 are one mirror; it reflects on both sides, but only inside its triangles. A path exists when every bounce hits a
-triangle of its plane, the vertices before and after the bounce lie on the same side of it, and no triangle crosses a
-segment between its ends.
+triangle of its plane, the vertices before and after the bounce lie on the same side of it, and no opaque triangle
+crosses a segment between its ends. Walls that let signals through do not turn a path: they weaken it and make it longer
+(:class:`~rayfix_evaluation.truth.walls.Walls`).
 """
 
 from dataclasses import dataclass, fields
@@ -14,10 +15,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rayfix_evaluation.truth.forward_kernels import hit_triangles, trace_paths, visible
-from rayfix_evaluation.truth.fresnel import reflection_gain_db
+from rayfix_evaluation.truth.diffraction import DiffractedPaths, diffracted_paths
+from rayfix_evaluation.truth.edges import Edges, find_edges
+from rayfix_evaluation.truth.forward_kernels import trace_paths, visible
 from rayfix_evaluation.truth.images import image_tree, mirror_scene
+from rayfix_evaluation.truth.interactions import Interactions, Polarisation, interactions
 from rayfix_evaluation.truth.mirrors import ImageTree, MirrorScene
+from rayfix_evaluation.truth.walls import Walls
 
 __all__ = ["ForwardSolver", "Paths", "StationSolver"]
 
@@ -29,33 +33,49 @@ class Paths:
     Attributes
     ----------
     path_length : ndarray of shape (n_paths,), m
-        Unfolded lengths.
+        Unfolded lengths, and what the slabs of walls add to them.
     azimuth : ndarray of shape (n_paths,), rad
         Azimuth of the direction from the station along the path's first segment, in (-pi, pi].
     zenith : ndarray of shape (n_paths,), rad
         Zenith of the same direction, in [0, pi].
     num_reflections : ndarray of int of shape (n_paths,)
-        Number of bounces; 0 is the line of sight.
+        Number of bounces; 0 is the straight path, which is the line of sight if it passes no wall.
+    num_walls : ndarray of int of shape (n_paths,)
+        Number of walls passed.
     gain_db : ndarray of shape (n_paths,), dB
-        Power gain relative to one metre of free space: ``-20 log10(path_length)`` minus the loss of the bounces.
+        Power gain relative to one metre of free space: ``-20 log10`` of the unfolded length minus the losses of the
+        bounces and the walls.
     vertices : ndarray of shape (n_paths, max_reflections + 2, 3), m
         Station, reflection points, point; unused rows repeat the point.
+    crossings : ndarray of shape (n_paths, most_walls, 3), m
+        Where the path enters each wall, in the order from the station; unused rows repeat the point.
     """
 
     path_length: NDArray[np.float64]
     azimuth: NDArray[np.float64]
     zenith: NDArray[np.float64]
     num_reflections: NDArray[np.int64]
+    num_walls: NDArray[np.int64]
     gain_db: NDArray[np.float64]
     vertices: NDArray[np.float64]
+    crossings: NDArray[np.float64]
 
     def __len__(self) -> int:
         """Return the number of paths."""
         return len(self.path_length)
 
+    @property
+    def line_of_sight(self) -> NDArray[np.bool_]:
+        """Whether each path is the line of sight: straight, through no wall; shape (n_paths,)."""
+        return np.asarray((self.num_reflections == 0) & (self.num_walls == 0))
+
     def only(self, index: int) -> "Paths":
         """Select one path, as a set with one element."""
-        return Paths(**{field.name: getattr(self, field.name)[index : index + 1] for field in fields(self)})
+        return self.chosen(np.array([index]))
+
+    def chosen(self, indices: NDArray[np.int64] | NDArray[np.bool_]) -> "Paths":
+        """Select paths by their indices, or by a mask."""
+        return Paths(**{field.name: getattr(self, field.name)[indices] for field in fields(self)})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,17 +91,25 @@ class ForwardSolver:
     max_path_length : float
         Largest length of a path, m.
     reflection_loss_db : float
-        Loss of each bounce, dB.
-    triangle_permittivity : ndarray of complex of shape (n_triangles,) or None
-        Complex relative permittivity of the scene's triangles; NaN for triangles with the constant loss, None if all
-        have it.
+        Loss of each bounce where the walls tell none, dB.
+    walls : Walls or None
+        What the scene's triangles are made of, in their order; None if all are opaque and have the constant loss.
+    max_loss_db : float
+        Paths that bounces and walls weaken by more than this are left out, dB.
+    polarisation : {"mixed", "kept"}
+        How the losses of both polarisations are averaged.
+    edges : Edges or None
+        Edges that bend paths, which :meth:`StationSolver.diffracted` finds; None if they were not asked for.
     """
 
     scene: MirrorScene
     max_reflections: int
     max_path_length: float
     reflection_loss_db: float
-    triangle_permittivity: NDArray[np.complex128] | None = None
+    walls: Walls | None = None
+    max_loss_db: float = np.inf
+    polarisation: Polarisation = "mixed"
+    edges: Edges | None = None
 
     @classmethod
     def from_mesh(
@@ -92,7 +120,10 @@ class ForwardSolver:
         max_reflections: int = 3,
         max_path_length: float = 60.0,
         reflection_loss_db: float = 6.0,
-        face_permittivity: ArrayLike | None = None,
+        walls: Walls | None = None,
+        max_loss_db: float = np.inf,
+        polarisation: Polarisation = "mixed",
+        diffraction: bool = False,
     ) -> "ForwardSolver":
         """Merge a mesh's coplanar triangles into mirrors and prepare the visibility tests.
 
@@ -107,10 +138,16 @@ class ForwardSolver:
         max_path_length : float
             Largest length of a path, m.
         reflection_loss_db : float
-            Loss of each bounce, dB.
-        face_permittivity : ndarray of complex of shape (n_faces,), optional
-            Complex relative permittivity of the triangles, which then reflect as half spaces; NaN for those that
-            have the constant loss.
+            Loss of each bounce where the walls tell none, dB.
+        walls : Walls, optional
+            What the faces are made of; all are opaque and have the constant loss when left out.
+        max_loss_db : float
+            Paths that bounces and walls weaken by more than this are left out, dB.
+        polarisation : {"mixed", "kept"}
+            How the losses of both polarisations are averaged: at each interaction, as tables do, or at the transmitter
+            only.
+        diffraction : bool
+            Whether to prepare the edges that bend paths. It needs walls, which state the carrier.
 
         Returns
         -------
@@ -128,23 +165,25 @@ class ForwardSolver:
             raise ValueError(f"max_reflections is {max_reflections}; it must not be negative")
         if not max_path_length > 0.0:
             raise ValueError(f"max_path_length is {max_path_length} m; it must be positive")
-        scene = mirror_scene(np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64))
-        permittivity = None
-        if face_permittivity is not None:
-            permittivity = np.asarray(face_permittivity, dtype=np.complex128)
-            if permittivity.shape != (len(np.asarray(faces)),):
-                raise ValueError(
-                    f"face_permittivity has the shape {permittivity.shape}; it must have one value for each of the "
-                    f"{len(np.asarray(faces))} faces"
-                )
-            permittivity = permittivity[scene.triangle_faces]
+        if not max_loss_db > 0.0:
+            raise ValueError(f"max_loss_db is {max_loss_db} dB; it must be positive")
+        triangles = np.asarray(faces, dtype=np.int64)
+        if walls is not None and len(walls) != len(triangles):
+            raise ValueError(f"the walls have {len(walls)} faces and the mesh {len(triangles)}; they must be the same")
+        if diffraction and walls is None:
+            raise ValueError("diffraction depends on the carrier; give walls, which state it")
+        places = np.asarray(vertices, dtype=np.float64)
+        scene = mirror_scene(places, triangles, walls)
         return cls(
             scene=scene,
             max_reflections=max_reflections,
             # An int would compile the kernels a second time.
             max_path_length=float(max_path_length),
             reflection_loss_db=float(reflection_loss_db),
-            triangle_permittivity=permittivity,
+            walls=None if walls is None else walls.of_faces(scene.triangle_faces),
+            max_loss_db=float(max_loss_db),
+            polarisation=polarisation,
+            edges=find_edges(scene, places[triangles][scene.triangle_faces]) if diffraction else None,
         )
 
     @property
@@ -245,36 +284,66 @@ class StationSolver:
         sequences, vertices, unfolded = trace_paths(
             solver.scene, self.tree, end, solver.max_reflections, solver.max_path_length
         )
+        met = self._interactions(sequences, vertices)
         offset = unfolded - self.position
         horizontal = np.hypot(offset[:, 0], offset[:, 1])
         length = np.hypot(horizontal, offset[:, 2])
-        num_reflections = (sequences >= 0).sum(axis=1)
-        gain = -20.0 * np.log10(length) + self._reflection_gain_db(sequences, vertices)
         azimuth = np.arctan2(offset[:, 1], offset[:, 0])
         azimuth[azimuth <= -np.pi] = np.pi  # arctan2 of -0.0
+        gain = -20.0 * np.log10(length) + met.gain_db
         order = np.argsort(-gain, kind="stable")
+        order = order[met.gain_db[order] >= -solver.max_loss_db]
         return Paths(
-            path_length=length[order],
-            azimuth=azimuth[order],
-            zenith=np.arctan2(horizontal, offset[:, 2])[order],
-            num_reflections=num_reflections[order],
-            gain_db=gain[order],
-            vertices=vertices[order],
+            path_length=length + met.excess_length,
+            azimuth=azimuth,
+            zenith=np.arctan2(horizontal, offset[:, 2]),
+            num_reflections=(sequences >= 0).sum(axis=1),
+            num_walls=met.num_walls,
+            gain_db=gain,
+            vertices=vertices,
+            crossings=met.crossings,
+        ).chosen(order)
+
+    def diffracted(self, point: ArrayLike) -> DiffractedPaths:
+        """Find the paths to a point that bend once round an edge and are not reflected.
+
+        Parameters
+        ----------
+        point : ndarray of shape (3,), m
+            Position of the transmitter.
+
+        Returns
+        -------
+        DiffractedPaths
+            Sorted by descending gain; through walls that let signals through, in any number.
+
+        Raises
+        ------
+        ValueError
+            If the solver was made without diffraction.
+        """
+        solver = self.solver
+        if solver.edges is None or solver.walls is None:
+            raise ValueError("this solver has no edges; make it with diffraction=True")
+        return diffracted_paths(
+            solver.scene,
+            solver.walls,
+            solver.edges,
+            self.position,
+            _position(point, "point"),
+            constant_loss_db=solver.reflection_loss_db,
         )
 
-    def _reflection_gain_db(self, sequences: NDArray[np.int64], vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sum of the gains of each path's bounces, shape (n_paths,), dB."""
+    def _interactions(self, sequences: NDArray[np.int64], vertices: NDArray[np.float64]) -> Interactions:
         solver = self.solver
-        gain = np.where(sequences >= 0, -solver.reflection_loss_db, 0.0)
-        if solver.triangle_permittivity is not None:
-            triangles = hit_triangles(solver.scene, sequences, vertices)
-            permittivity = np.where(triangles >= 0, solver.triangle_permittivity[triangles], np.nan)
-            path, bounce = np.nonzero(np.isfinite(permittivity))
-            step = vertices[path, bounce + 1] - vertices[path, bounce]
-            normals = solver.scene.normals[sequences[path, bounce]]
-            cosine = np.abs(np.einsum("ij,ij->i", step, normals)) / np.linalg.norm(step, axis=1)
-            gain[path, bounce] = reflection_gain_db(np.minimum(cosine, 1.0), permittivity[path, bounce])
-        return np.asarray(gain.sum(axis=1))
+        return interactions(
+            solver.scene,
+            solver.walls,
+            sequences,
+            vertices,
+            constant_loss_db=solver.reflection_loss_db,
+            polarisation=solver.polarisation,
+        )
 
 
 def _position(position: ArrayLike, name: str) -> NDArray[np.float64]:

@@ -167,7 +167,7 @@ def hit_triangles(
     Returns
     -------
     ndarray of int of shape (n_paths, max_reflections)
-        The first triangle of the plane that holds the hit, -1 where there is no bounce.
+        The first triangle of the plane that holds the hit and reflects on this side, -1 where there is no bounce.
     """
     out = np.full(sequences.shape, -1)
     for i in range(sequences.shape[0]):
@@ -176,10 +176,8 @@ def hit_triangles(
             if plane < 0:
                 break
             x, y, z = vertices[i, bounce + 1]
-            for triangle in range(scene.plane_starts[plane], scene.plane_starts[plane + 1]):
-                if _in_triangle(scene, triangle, x, y, z):
-                    out[i, bounce] = triangle
-                    break
+            side = plane_distance(scene, plane, vertices[i, bounce])
+            out[i, bounce] = _reflecting(scene, plane, side, x, y, z)
     return out
 
 
@@ -203,7 +201,16 @@ def visible(scene: "MirrorScene", start: NDArray[np.float64], ends: NDArray[np.f
     """
     out = np.empty(len(ends), np.bool_)
     for i in range(len(ends)):
-        out[i] = not _blocked(scene, start, ends[i], -1, -1)
+        out[i] = not _blocked(scene, start, ends[i], -1, -1, True)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def visible_through(scene: "MirrorScene", start: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether nothing opaque crosses the straight segments from one point to others; see :func:`visible`."""
+    out = np.empty(len(ends), np.bool_)
+    for i in range(len(ends)):
+        out[i] = not _blocked(scene, start, ends[i], -1, -1, False)
     return out
 
 
@@ -263,26 +270,42 @@ def _is_path(scene: "MirrorScene", sequence: NDArray[np.int64], vertices: NDArra
         if before * after <= 0.0 or abs(before) < SIDE_MARGIN or abs(after) < SIDE_MARGIN:
             return False
     for i in range(n_hits - 1, -1, -1):
-        found = False
-        for triangle in range(scene.plane_starts[sequence[i]], scene.plane_starts[sequence[i] + 1]):
-            if _in_triangle(scene, triangle, vertices[i + 1, 0], vertices[i + 1, 1], vertices[i + 1, 2]):
-                found = True
-                break
-        if not found:
+        side = plane_distance(scene, sequence[i], vertices[i])
+        if _reflecting(scene, sequence[i], side, vertices[i + 1, 0], vertices[i + 1, 1], vertices[i + 1, 2]) < 0:
             return False
     for i in range(n_hits, -1, -1):
         mirror_before = sequence[i - 1] if i > 0 else -1
         mirror_after = sequence[i] if i < n_hits else -1
-        if _blocked(scene, vertices[i], vertices[i + 1], mirror_before, mirror_after):
+        if _blocked(scene, vertices[i], vertices[i + 1], mirror_before, mirror_after, False):
             return False
     return True
 
 
 @njit(cache=True, nogil=True)
+def _reflecting(scene: "MirrorScene", plane: int, side: float, x: float, y: float, z: float) -> int:
+    """Triangle of a plane that reflects at a point of it, for rays from a side; -1 if there is none.
+
+    A closed part that lets signals through reflects only outside: its slab holds what runs to and fro inside.
+    """
+    for triangle in range(scene.plane_starts[plane], scene.plane_starts[plane + 1]):
+        if scene.triangle_inside[triangle] * side <= 0.0 and in_triangle(scene, triangle, x, y, z):
+            return triangle
+    return -1
+
+
+@njit(cache=True, nogil=True)
 def _blocked(
-    scene: "MirrorScene", start: NDArray[np.float64], end: NDArray[np.float64], skip_a: int, skip_b: int
+    scene: "MirrorScene",
+    start: NDArray[np.float64],
+    end: NDArray[np.float64],
+    skip_a: int,
+    skip_b: int,
+    by_open: bool,
 ) -> bool:
-    """Whether a triangle crosses a segment strictly between its ends; two planes are left out."""
+    """Whether a triangle crosses a segment strictly between its ends; two planes are left out.
+
+    Triangles that let signals through block only if ``by_open`` is set.
+    """
     x, y, z = start[0], start[1], start[2]
     dx, dy, dz = end[0] - x, end[1] - y, end[2] - z
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -316,7 +339,7 @@ def _blocked(
         for i in range(scene.box_starts[box], scene.box_ends[box]):
             triangle = scene.box_triangles[i]
             plane = scene.triangle_planes[triangle]
-            if plane in (skip_a, skip_b):
+            if plane in (skip_a, skip_b) or (scene.triangle_open[triangle] and not by_open):
                 continue
             nx = scene.triangle_normals[triangle, 0]
             ny = scene.triangle_normals[triangle, 1]
@@ -327,14 +350,14 @@ def _blocked(
             share = (scene.triangle_offsets[triangle] - (nx * x + ny * y + nz * z)) / slope
             if share <= least or share >= 1.0 - least:
                 continue
-            if _in_triangle(scene, triangle, x + share * dx, y + share * dy, z + share * dz):
+            if in_triangle(scene, triangle, x + share * dx, y + share * dy, z + share * dz):
                 return True
         box += 1
     return False
 
 
 @njit(cache=True, nogil=True)
-def _in_triangle(scene: "MirrorScene", triangle: int, x: float, y: float, z: float) -> bool:
+def in_triangle(scene: "MirrorScene", triangle: int, x: float, y: float, z: float) -> bool:
     """Whether a point of a triangle's plane lies in the triangle or on its edges."""
     for e in range(3):
         distance = (

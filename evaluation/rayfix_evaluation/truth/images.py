@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from rayfix_evaluation.truth.image_kernels import expand_level, group_coplanar
 from rayfix_evaluation.truth.mirrors import ImageTree, MirrorScene
+from rayfix_evaluation.truth.passages import inner_sides
+from rayfix_evaluation.truth.walls import Walls
 from rayfix_tables.errors import SceneError
 
 COPLANAR_DISTANCE = 1e-5
@@ -31,7 +33,7 @@ _MAX_OUTLINE = 12  # corners; a hull with more is replaced by its bounding recta
 _LEAF_SIZE = 4  # triangles in a leaf of the hierarchy
 
 
-def mirror_scene(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> MirrorScene:
+def mirror_scene(vertices: NDArray[np.float64], faces: NDArray[np.int64], walls: Walls | None = None) -> MirrorScene:
     """Merge the triangles of a mesh into mirror planes and prepare the visibility tests.
 
     Parameters
@@ -40,6 +42,8 @@ def mirror_scene(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Mir
         Vertices of the mesh.
     faces : ndarray of int of shape (n_faces, 3)
         Vertex indices of the triangles; triangles without area are ignored.
+    walls : Walls, optional
+        What the faces are made of; nothing passes through any of them when left out.
 
     Returns
     -------
@@ -73,6 +77,13 @@ def mirror_scene(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Mir
     starts = np.searchsorted(planes, np.arange(len(normals) + 1)).astype(np.int64)
     plane_low = np.minimum.reduceat(corners.min(axis=1), starts[:-1]) - _BOX_MARGIN
     plane_high = np.maximum.reduceat(corners.max(axis=1), starts[:-1]) + _BOX_MARGIN
+    opened = np.zeros(len(corners), np.bool_)
+    solids = np.full(len(corners), -1, np.int64)
+    if walls is not None:
+        opened = walls.lets_through[triangle_faces]
+        solids = np.where(opened, walls.solid[triangle_faces], -1).astype(np.int64)
+    inside = inner_sides(corners, triangle_normals, solids)
+    inside *= np.where(np.einsum("fi,fi->f", triangle_normals, normals[planes]) > 0.0, 1, -1)
     edges = np.roll(corners, -1, axis=1) - corners
     edge_normals = np.cross(triangle_normals[:, None, :], edges)
     edge_normals /= np.linalg.norm(edge_normals, axis=2, keepdims=True)
@@ -91,6 +102,9 @@ def mirror_scene(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Mir
         triangle_faces=triangle_faces,
         triangle_normals=triangle_normals,
         triangle_offsets=np.einsum("fi,fi->f", triangle_normals, corners[:, 0]),
+        triangle_open=opened,
+        triangle_solids=solids,
+        triangle_inside=inside,
         edge_normals=edge_normals,
         edge_offsets=np.einsum("fei,fei->fe", edge_normals, corners),
         box_low=box_low,

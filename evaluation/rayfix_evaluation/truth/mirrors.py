@@ -31,6 +31,13 @@ class MirrorScene(NamedTuple):
         Index of the triangle among the mesh's faces.
     triangle_normals, triangle_offsets : ndarray of shape (n_triangles, 3) and (n_triangles,), 1 and m
         The triangle's own plane, which may differ from its mirror plane by the merging tolerance.
+    triangle_open : ndarray of bool of shape (n_triangles,)
+        Whether signals pass through the triangle.
+    triangle_solids : ndarray of int of shape (n_triangles,)
+        Closed part of the mesh that the triangle belongs to; -1 for sheets and for triangles that nothing passes.
+    triangle_inside : ndarray of int of shape (n_triangles,)
+        Side of the mirror plane on which this closed part lies: 1 along the plane's normal, -1 against it, 0 for
+        sheets.
     edge_normals, edge_offsets : ndarray of shape (n_triangles, 3, 3) and (n_triangles, 3), 1 and m
         Inward unit normals of the edges within the triangle's plane: ``edge_normals @ x - edge_offsets`` are
         the distances of x from the three edges, positive inside.
@@ -56,6 +63,9 @@ class MirrorScene(NamedTuple):
     triangle_faces: NDArray[np.int64]
     triangle_normals: NDArray[np.float64]
     triangle_offsets: NDArray[np.float64]
+    triangle_open: NDArray[np.bool_]
+    triangle_solids: NDArray[np.int64]
+    triangle_inside: NDArray[np.int64]
     edge_normals: NDArray[np.float64]
     edge_offsets: NDArray[np.float64]
     box_low: NDArray[np.float64]

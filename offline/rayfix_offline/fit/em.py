@@ -14,7 +14,7 @@ from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
 from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit
-from rayfix_offline.fit.tubes import Fitted, fitted_cells
+from rayfix_offline.fit.tubes import Fitted, Labels, fitted_cells
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_tables.geometry.angles import tangent, wrap
 from rayfix_tables.mixture import TubeMixture
@@ -37,10 +37,10 @@ def fit_em(
     with threadpool_limits(limits=1):
         for n, (centre, cell) in enumerate(zip(centres, cells, strict=True)):
             rng = np.random.default_rng([fit.seed, int(cell)])
-            points, num_reflections, mass = sample_points(centre, level, fit.num_points, rng, cutoff=fit.cutoff)
+            points, labels, mass = sample_points(centre, level, fit.num_points, rng, cutoff=fit.cutoff)
             if not len(points):
                 continue
-            part = _fit_points(np.log(mass), points, num_reflections, fit, int(rng.integers(2**31)))
+            part = _fit_points(np.log(mass), points, labels, fit, int(rng.integers(2**31)))
             counts[n], log_mass[n], dropped[n] = part.counts[0], part.log_mass[0], part.dropped[0]
             parts.append(part.mixture)
     return Fitted(counts, log_mass, TubeMixture.concatenate(parts), dropped)
@@ -53,7 +53,7 @@ def sample_points(
     rng: np.random.Generator,
     *,
     cutoff: float = RayFit.cutoff,
-) -> tuple[NDArray[np.float64], NDArray[np.int8], float]:
+) -> tuple[NDArray[np.float64], Labels, float]:
     """Draw points from the measure of a cell.
 
     Parameters
@@ -65,7 +65,8 @@ def sample_points(
     -------
     points : ndarray of shape (count, 6)
         (path length, horizontal and vertical angle, x, y, z); none if no ray reaches the cell.
-    num_reflections : ndarray of int8, shape (count,)
+    labels : Labels
+        Of shape (count,).
     mass : float
         The cell's mass.
     """
@@ -85,7 +86,7 @@ def sample_points(
     weight = density[ray] * chosen.mass
     mass = float(weight.sum())
     if mass <= 0.0:
-        return np.zeros((0, 6)), np.zeros(0, np.int8), 0.0
+        return np.zeros((0, 6)), Labels(np.zeros(0, np.int8), np.zeros(0, np.int8)), 0.0
     drawn = rng.choice(len(weight), size=count, p=weight / mass)
     # A ray represents a solid angle, and a piece an interval of lengths.
     half = np.sqrt(3.0 * chosen.variance[drawn])
@@ -100,14 +101,15 @@ def sample_points(
     position = sequences.images[sequence] + length[:, None] * np.einsum(
         "nij,nj->ni", sequences.mirrors[sequence], launched
     )
-    points = np.concatenate([length[:, None], at, position], axis=1)
-    return points, sequences.num_reflections[sequence], mass
+    measured = length + chosen.excess[drawn]
+    points = np.concatenate([measured[:, None], at, position], axis=1)
+    return points, Labels(sequences.num_reflections[sequence], chosen.num_walls[drawn]), mass
 
 
 def _fit_points(
     log_mass: float,
     points: NDArray[np.float64],
-    num_reflections: NDArray[np.int8],
+    labels: Labels,
     fit: ExpectationMaximisation,
     seed: int,
 ) -> Fitted:
@@ -131,23 +133,24 @@ def _fit_points(
     floor = np.array([0.0, 0.0, 0.0, fit.position_floor, fit.position_floor, fit.position_floor]) ** 2
     cov = chosen.covariances_ * np.outer(scale, scale) + np.diag(floor)
     member = chosen.predict(scaled)
-    reflections = np.array(
-        [
-            np.bincount(num_reflections[member == k]).argmax() if np.any(member == k) else 0
-            for k in range(len(chosen.weights_))
-        ],
-        np.int8,
-    )
+    own = Labels(*(_most_frequent(column, member, len(chosen.weights_)) for column in labels))
     found = fitted_cells(
         np.array([len(chosen.weights_)]),
         np.array([log_mass]),
         np.log(np.maximum(chosen.weights_, fit.min_weight)),
         chosen.means_ * scale + points.mean(axis=0),
         cov,
-        reflections,
+        own,
         position_floor=fit.position_floor,
     )
     # The floor of the length lies along the tube, so that it adds to u_cov only.
     u_cov = found.mixture.u_cov.copy()
     u_cov[:, 0] += fit.length_floor**2
     return found._replace(mixture=replace(found.mixture, u_cov=u_cov))
+
+
+def _most_frequent(labels: NDArray[np.int8], member: NDArray[np.int64], count: int) -> NDArray[np.int8]:
+    """Most frequent label of the points of each component, 0 without points."""
+    return np.array(
+        [np.bincount(labels[member == k]).argmax() if np.any(member == k) else 0 for k in range(count)], np.int8
+    )

@@ -14,6 +14,7 @@ def join_groups(
     mean: Any,
     cov: Any,
     mirror: Any,
+    num_walls: Any,
 ) -> Any:
     """Join the groups of the same surface sequence and slice.
 
@@ -24,6 +25,7 @@ def join_groups(
     mean : ndarray of shape (n, d)
     cov : ndarray of shape (n, d, d)
     mirror : ndarray of shape (n, 3, 3)
+    num_walls : ndarray of int64, shape (n,)
 
     Returns
     -------
@@ -34,6 +36,8 @@ def join_groups(
         Sum of the covariances within the groups and of their means.
     mirror : ndarray of shape (m, 3, 3)
         Mean, weighted by mass: the effect of a small change of the launch direction on the position.
+    num_walls : ndarray of int64, shape (m,)
+        Of the first of the groups.
     """
     count, size = mean.shape
     order = np.argsort(surface_sequence * (slices.max() + 1) + slices, kind="mergesort") if count else np.arange(0)
@@ -69,4 +73,4 @@ def join_groups(
             for b in range(size):
                 apart = (mean[i, a] - out_mean[g, a]) * (mean[i, b] - out_mean[g, b])
                 out_cov[g, a, b] += fraction * (cov[i, a, b] + apart)
-    return surface_sequence[first], out_mass, out_mean, out_cov, out_mirror
+    return surface_sequence[first], out_mass, out_mean, out_cov, out_mirror, num_walls[first]

@@ -17,8 +17,11 @@ from rayfix_offline.rays.segments import Sequences
 SIZE = 6
 """Length of the joint vector."""
 
-NUM_SUMS = 28
-"""Sums of a group: 6 of mass (1, a, a a), 12 of mass x length (1, a, d, d a), 10 of mass x length^2 (1, d, d d)."""
+NUM_SUMS = 29
+"""Sums of a group: 6 of mass (1, a, a a), 12 of mass x length (1, a, d, d a), 10 of mass x length^2 (1, d, d d), and
+mass x number of walls.
+
+The length of d is the geometric one, the others are measured lengths, which walls make longer."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -43,7 +46,7 @@ class GatheredRays(NamedTuple):
         Of the grid with a ray in each of its cells, as in :class:`~rayfix_tables.grid.AngularGrid`.
     azimuth, zenith, solid_angle, directions
         As in :class:`~rayfix_offline.rays.rays.RaySet`.
-    offsets, sequence, slice, mass, mean, variance
+    offsets, sequence, slice, mass, mean, variance, excess, num_walls
         As in :class:`~rayfix_offline.rays.pieces.Pieces`.
     images, mirrors
         As in :class:`~rayfix_offline.rays.segments.Sequences`.
@@ -61,6 +64,8 @@ class GatheredRays(NamedTuple):
     mass: NDArray[np.float64]
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
+    excess: NDArray[np.float32]
+    num_walls: NDArray[np.int8]
     images: NDArray[np.float64]
     mirrors: NDArray[np.float64]
 
@@ -80,6 +85,8 @@ def gathered_rays(rays: RaySet, pieces: Pieces, sequences: Sequences) -> Gathere
         mass=pieces.mass,
         mean=pieces.mean,
         variance=pieces.variance,
+        excess=pieces.excess,
+        num_walls=pieces.num_walls,
         images=sequences.images,
         mirrors=sequences.mirrors,
     )
@@ -117,8 +124,9 @@ def gather_groups(
 ) -> Any:
     """Sum up the weighted moments of one cell.
 
-    Of a ray with launch direction d and tangent angles a, a piece of path length L lies at ``image + mirror @ (L d)``.
-    The moments of (L, a, L d) are therefore those of L times products of a and d, which are the same for all pieces.
+    Of a ray with launch direction d and tangent angles a, a piece of geometric length L lies at
+    ``image + mirror @ (L d)``. The moments of (L, a, L d) are therefore those of L times products of a and d, which are
+    the same for all pieces.
 
     Parameters
     ----------
@@ -136,6 +144,8 @@ def gather_groups(
     -------
     sequence : ndarray of int64, shape (n_groups,)
     slice : ndarray of int64, shape (n_groups,)
+    num_walls : ndarray of int64, shape (n_groups,)
+        Mean number of walls, rounded.
     mass : ndarray of shape (n_groups,)
     mean : ndarray of shape (n_groups, 6)
     cov : ndarray of shape (n_groups, 6, 6)
@@ -174,13 +184,15 @@ def gather_groups(
             count, num_rows = _add_ray(density, horizontal, vertical, ray, rays, groups, count, num_rows)
 
     masses = np.empty(count)
+    num_walls = np.empty(count, np.int64)
     means = np.empty((count, SIZE))
     covs = np.empty((count, SIZE, SIZE))
     for group in range(count):
         rows[keys[group, 0]] = -1
         masses[group] = sums[group, 0]
+        num_walls[group] = int(sums[group, 28] / sums[group, 0] + 0.5)
         _to_moments(sums[group], rays.images[keys[group, 0]], rays.mirrors[keys[group, 0]], means[group], covs[group])
-    return keys[:count, 0], keys[:count, 1], masses, means, covs
+    return keys[:count, 0], keys[:count, 1], num_walls, masses, means, covs
 
 
 @numba.njit(cache=True, nogil=True)
@@ -218,18 +230,22 @@ def _add_ray(
             slots[row, number] = group
             keys[group, 0] = sequence
             keys[group, 1] = number
-        mean = rays.mean[piece]
+        mean, excess = rays.mean[piece], rays.excess[piece]
+        measured = mean + excess
         once = mass * mean
         twice = mass * (rays.variance[piece] + mean * mean)
+        measured_once = mass * measured
+        measured_twice = mass * (rays.variance[piece] + measured * measured)
+        across = mass * (rays.variance[piece] + measured * mean)
         sums[group, 0] += mass
         sums[group, 1] += mass * horizontal
         sums[group, 2] += mass * vertical
         sums[group, 3] += mass * (horizontal * horizontal)
         sums[group, 4] += mass * (horizontal * vertical)
         sums[group, 5] += mass * (vertical * vertical)
-        sums[group, 6] += once
-        sums[group, 7] += once * horizontal
-        sums[group, 8] += once * vertical
+        sums[group, 6] += measured_once
+        sums[group, 7] += measured_once * horizontal
+        sums[group, 8] += measured_once * vertical
         sums[group, 9] += once * x
         sums[group, 10] += once * y
         sums[group, 11] += once * z
@@ -239,16 +255,17 @@ def _add_ray(
         sums[group, 15] += once * (x * vertical)
         sums[group, 16] += once * (y * vertical)
         sums[group, 17] += once * (z * vertical)
-        sums[group, 18] += twice
-        sums[group, 19] += twice * x
-        sums[group, 20] += twice * y
-        sums[group, 21] += twice * z
+        sums[group, 18] += measured_twice
+        sums[group, 19] += across * x
+        sums[group, 20] += across * y
+        sums[group, 21] += across * z
         sums[group, 22] += twice * (x * x)
         sums[group, 23] += twice * (x * y)
         sums[group, 24] += twice * (x * z)
         sums[group, 25] += twice * (y * y)
         sums[group, 26] += twice * (y * z)
         sums[group, 27] += twice * (z * z)
+        sums[group, 28] += mass * rays.num_walls[piece]
     return count, num_rows
 
 

@@ -37,6 +37,13 @@ class Fitted(NamedTuple):
     dropped: NDArray[np.int64]
 
 
+class Labels(NamedTuple):
+    """What components are called; fields as in :class:`~rayfix_tables.mixture.TubeMixture`."""
+
+    num_reflections: NDArray[np.int8]
+    num_walls: NDArray[np.int8]
+
+
 class _Numbers(NamedTuple):
     """:class:`~rayfix_offline.fit.settings.TubeFit`, as the kernel reads it."""
 
@@ -58,7 +65,7 @@ def fit_tubes(centres: NDArray[np.float64], level: LevelRays, fit: TubeFit) -> F
         Azimuths and zeniths.
     """
     sequences = level.sequences
-    counts, log_mass, log_weight, mean, cov, label = _fit_block(
+    counts, log_mass, log_weight, mean, cov, label, num_walls = _fit_block(
         centres,
         level.window,
         gathered_rays(level.rays, level.pieces, sequences),
@@ -69,9 +76,8 @@ def fit_tubes(centres: NDArray[np.float64], level: LevelRays, fit: TubeFit) -> F
         _Numbers(**asdict(fit)),
         new_rows(len(sequences.images)),
     )
-    return fitted_cells(
-        counts, log_mass, log_weight, mean, cov, sequences.num_reflections[label], position_floor=fit.position_floor
-    )
+    labels = Labels(sequences.num_reflections[label], num_walls.astype(np.int8))
+    return fitted_cells(counts, log_mass, log_weight, mean, cov, labels, position_floor=fit.position_floor)
 
 
 def fitted_cells(
@@ -80,7 +86,7 @@ def fitted_cells(
     log_weight: NDArray[np.float64],
     mean: NDArray[np.float64],
     cov: NDArray[np.float64],
-    num_reflections: NDArray[np.int8],
+    labels: Labels,
     *,
     position_floor: float,
 ) -> Fitted:
@@ -94,7 +100,7 @@ def fitted_cells(
     counts, log_mass
         As in :class:`Fitted`, before components are dropped.
     log_weight : ndarray of shape (n,)
-    mean, cov, num_reflections, position_floor
+    mean, cov, labels, position_floor
         As in :func:`joint_to_tubes`.
     """
     proper = np.isfinite(mean).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)) & (mean[:, 0] > 0.0)
@@ -110,8 +116,8 @@ def fitted_cells(
         dropped = np.bincount(cell[~proper], minlength=len(counts))
         counts, log_mass = counts - dropped, log_mass + log_left
         log_weight = (log_weight - log_left[cell])[proper]
-        mean, cov, num_reflections = mean[proper], cov[proper], num_reflections[proper]
-    mixture = joint_to_tubes(log_weight, mean, cov, num_reflections, position_floor=position_floor)
+        mean, cov, labels = mean[proper], cov[proper], Labels(*(column[proper] for column in labels))
+    mixture = joint_to_tubes(log_weight, mean, cov, labels, position_floor=position_floor)
     return Fitted(counts, log_mass, mixture, dropped)
 
 
@@ -119,7 +125,7 @@ def joint_to_tubes(
     log_weight: NDArray[np.float64],
     mean: NDArray[np.float64],
     cov: NDArray[np.float64],
-    num_reflections: NDArray[np.int8],
+    labels: Labels,
     *,
     position_floor: float,
 ) -> TubeMixture:
@@ -150,7 +156,7 @@ def joint_to_tubes(
         x_mean=mean[:, 3:],
         jacobian=jacobian,
         x_cov=pack(x_cov),
-        num_reflections=num_reflections,
+        **labels._asdict(),
     ).as_stored()
 
 
@@ -174,15 +180,16 @@ def _fit_block(
     mean = np.empty((num_cells * fit.max_components, 6))
     cov = np.empty((num_cells * fit.max_components, 6, 6))
     label = np.empty(num_cells * fit.max_components, np.int64)
+    num_walls = np.empty(num_cells * fit.max_components, np.int64)
     total = 0
     for cell in range(num_cells):
-        seq, slices, mass, group_mean, group_cov = gather_groups(
+        seq, slices, walls, mass, group_mean, group_cov = gather_groups(
             centres[cell, 0], centres[cell, 1], window, fit.cutoff, rays, num_slices, rows
         )
         group_mirror = rays.mirrors[seq]
         if curved:
-            seq, mass, group_mean, group_cov, group_mirror = join_groups(
-                surface_sequences[seq], slices, mass, group_mean, group_cov, group_mirror
+            seq, mass, group_mean, group_cov, group_mirror, walls = join_groups(
+                surface_sequences[seq], slices, mass, group_mean, group_cov, group_mirror, walls
             )
         whole = mass.sum()
         if whole <= 0.0:
@@ -197,7 +204,7 @@ def _fit_block(
         weight = mass[chosen] / mass[chosen].sum()
         part_mean = group_mean[chosen]
         part_cov = group_cov[chosen]
-        part_label = seq[chosen]
+        part_label = chosen.copy()
         part_mirror = group_mirror[chosen]
         for i in range(kept):
             blur(
@@ -217,7 +224,8 @@ def _fit_block(
                 log_weight[total] = np.log(weight[i])
                 mean[total] = part_mean[i]
                 cov[total] = part_cov[i]
-                label[total] = part_label[i]
+                label[total] = seq[part_label[i]]
+                num_walls[total] = walls[part_label[i]]
                 total += 1
                 counts[cell] += 1
-    return counts, log_mass, log_weight[:total], mean[:total], cov[:total], label[:total]
+    return counts, log_mass, log_weight[:total], mean[:total], cov[:total], label[:total], num_walls[:total]

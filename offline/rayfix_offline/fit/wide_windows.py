@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.fit.moments import SIZE
 from rayfix_offline.fit.settings import CoarseFit
-from rayfix_offline.fit.tubes import fitted_cells
+from rayfix_offline.fit.tubes import Labels, fitted_cells
 from rayfix_tables.gaussians.tree_reduction import halve_and_merge
 from rayfix_tables.gaussians.triangles import unpack_upper
 from rayfix_tables.level import Level
@@ -40,7 +40,6 @@ class _FinerCells(NamedTuple):
     x_mean: NDArray[np.float32]
     jacobian: NDArray[np.float32]
     x_cov: NDArray[np.float32]
-    num_reflections: NDArray[np.int8]
 
     @classmethod
     def of(cls, level: Level, change: NDArray[np.float64]) -> "_FinerCells":
@@ -60,7 +59,6 @@ class _FinerCells(NamedTuple):
             x_mean=mixture.x_mean,
             jacobian=mixture.jacobian,
             x_cov=mixture.x_cov,
-            num_reflections=mixture.num_reflections,
         )
 
 
@@ -124,11 +122,10 @@ def sum_cells(
             fit.min_length,
         )
         parts.append(components)
-    weight, mean, cov, num_reflections = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    weight, mean, cov, heaviest = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    labels = Labels(finer.mixture.num_reflections[heaviest], finer.mixture.num_walls[heaviest])
     counts = np.array([len(components[0]) for components in parts])
-    fitted = fitted_cells(
-        counts, log_mass, np.log(weight), mean, cov, num_reflections, position_floor=fit.position_floor
-    )
+    fitted = fitted_cells(counts, log_mass, np.log(weight), mean, cov, labels, position_floor=fit.position_floor)
     return SummedCells(change=change / np.maximum(1.0 - change, 0.5), **fitted._asdict())
 
 
@@ -184,7 +181,7 @@ def _sum_cell(
     length_stretch: Any,
     min_length: Any,
 ) -> Any:
-    """Sum the cells around a direction: log mass, change, weights, means, covariances and numbers of reflections."""
+    """Sum the cells around a direction: log mass, change, weights, means, covariances and heaviest finer components."""
     fine_window, ring_offsets, ring_cells = finer.window, finer.ring_offsets, finer.ring_cells
     offsets, cell_log_mass = finer.cell_offsets, finer.cell_log_mass
     num_rings = len(ring_cells)
@@ -219,7 +216,7 @@ def _sum_cell(
             logs.append(np.log(density * finer.solid_angles[ring]) + cell_log_mass[cell])
             moved.append((across, down, stretch))
             total += offsets[cell + 1] - offsets[cell]
-    weight, label = np.empty(total), np.empty(total, np.int8)
+    weight, label = np.empty(total), np.empty(total, np.int64)
     mean, cov = np.empty((total, SIZE)), np.empty((total, SIZE, SIZE))
     if total == 0:
         return -np.inf, 0.0, weight, mean, cov, label
@@ -234,7 +231,7 @@ def _sum_cell(
         change += factor * finer.cell_change[cells[n]]
         for k in range(offsets[cells[n]], offsets[cells[n] + 1]):
             weight[row] = factor * np.exp(np.float64(finer.log_weight[k]))
-            label[row] = finer.num_reflections[k]
+            label[row] = k
             _joint(k, finer, mean[row], cov[row])
             mean[row, 1] = across + stretch * mean[row, 1]
             mean[row, 2] += down
@@ -243,7 +240,7 @@ def _sum_cell(
                 cov[row, i, 1] *= stretch
             row += 1
     weight /= weight.sum()
-    # A merged component has the number of reflections of its heaviest part.
+    # A merged component has the labels of its heaviest part.
     heaviest = weight.copy()
     scale, one_group = _scale(weight, mean, noise, length_stretch, min_length), np.zeros(total, np.int64)
     into = halve_and_merge(weight, mean, cov, one_group, scale, noise, max_divergence)

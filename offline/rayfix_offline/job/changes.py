@@ -44,6 +44,8 @@ class _Trace(NamedTuple):
     mass: NDArray[np.float64]
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
+    excess: NDArray[np.float32]
+    num_walls: NDArray[np.int8]
     images: NDArray[np.float64]
     mirrors: NDArray[np.float64]
     surfaces: NDArray[np.int64]
@@ -59,6 +61,8 @@ class _Trace(NamedTuple):
             mass=pieces.mass,
             mean=pieces.mean,
             variance=pieces.variance,
+            excess=pieces.excess,
+            num_walls=pieces.num_walls,
             images=sequences.images,
             mirrors=sequences.mirrors,
             surfaces=level.surface_sequences,
@@ -167,12 +171,14 @@ def _compare(a: Any, b: Any, same_course: Any) -> Any:
                 if distance <= same_course and i < end_i and j < end_j and a.slice[i] == b.slice[j]:
                     change[ray] += abs(a.mass[i] - b.mass[j])
                     mass[ray] += b.mass[j]
-                    moved = abs(a.mean[i] - b.mean[j])
+                    moved = abs(a.mean[i] - b.mean[j]) + abs(a.excess[i] - b.excess[j])
                     if moved > 0.0:
                         # The L1 distance of two normal densities is below their distance in standard deviations.
                         stdev = np.sqrt(max(a.variance[i], b.variance[j]))
                         change[ray] += min(a.mass[i], b.mass[j]) * (min(2.0, moved / stdev) if stdev else 2.0)
                     if a.mass[i] != b.mass[j] or moved > 0.0 or a.variance[i] != b.variance[j]:
+                        same[ray] = False
+                    if a.num_walls[i] != b.num_walls[j]:
                         same[ray] = False
                     i += 1
                     j += 1

@@ -99,6 +99,7 @@ def plan_build(site: SiteFile, twin: Twin, method: Method | None = None) -> tupl
     method : Method, optional
     """
     method = method or Method()
+    thickness = twin.scene.face_thickness
     common = content_key(
         BUILD_VERSION,
         ARRAYS_VERSION,
@@ -106,6 +107,8 @@ def plan_build(site: SiteFile, twin: Twin, method: Method | None = None) -> tupl
         twin.scene.sha256,
         hashlib.sha256(np.packbits(twin.free_space.free).tobytes()).hexdigest(),
         [*twin.free_space.origin.tolist(), twin.free_space.voxel_size, *twin.free_space.free.shape],
+        hashlib.sha256(b"" if thickness is None else thickness.tobytes()).hexdigest(),
+        {name: material.model_dump(mode="json") for name, material in site.materials.items()},
         site.propagation.model_dump(mode="json"),
         site.table.model_dump(mode="json"),
     )

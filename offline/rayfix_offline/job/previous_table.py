@@ -153,6 +153,7 @@ class FormerTable:
             materials=stored.materials,
             face_objects=np.zeros(len(stored.faces), np.int32),
             objects=("scene",),
+            face_thickness=stored.face_thickness,
         )
         try:
             site = parse_site(self.table.site.document).moved(-self.table.scene.origin)

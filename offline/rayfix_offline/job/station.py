@@ -162,5 +162,7 @@ def _assemble(
         levels=tuple(level for level, _ in levels),
         lost_ray_share=float(launch["lost_ray_share"]),
         coverage=tuple(float(fraction) for fraction in launch["coverage"]),
+        wall_coverage=tuple(float(fraction) for fraction in launch["wall_coverage"]),
+        cut_power_share=float(launch["cut_power_share"]),
         paths=PathMap.from_arrays(launch),
     )

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.rays.launch import launch
 from rayfix_offline.rays.rays import sample_rays
-from rayfix_offline.scene.materials import constant_reflectivity
+from rayfix_offline.scene.walls import opaque_walls
 from rayfix_offline.site import StationSection
 from rayfix_offline.twin.twin import Twin
 
@@ -75,18 +75,18 @@ def find_escapes(station: StationSection, twin: Twin, *, max_reflections: int) -
         rays.directions,
         engine=twin.engine,
         planes=twin.planes,
-        reflectivity=constant_reflectivity(len(twin.scene.faces), loss_db=0.0),
+        walls=opaque_walls(len(twin.scene.faces), loss_db=0.0),
         bounds=twin.scene.bounds,
         max_reflections=depth,
         max_path_length=ENDLESS,
     )
     # One segment more than is checked: a ray without it has left the scene before.
-    lost = np.flatnonzero(segments.sequence[:, depth] < 0)
+    lost = np.flatnonzero(np.diff(segments.offsets) <= depth)
     share = len(lost) / len(rays)
     if not len(lost):
         return Escapes(station_id=station.id, share=share, side=None, side_share=0.0, place=None, place_share=0.0)
-    last = (segments.sequence[lost] >= 0).sum(axis=1) - 1
-    sequence, length = segments.sequence[lost, last], segments.end[lost, last]
+    last = segments.offsets[lost + 1] - 1
+    sequence, length = segments.sequence[last], segments.end[last]
     heading = np.einsum("nij,nj->ni", segments.sequences.mirrors[sequence], rays.directions[lost])
     ends = segments.sequences.images[sequence] + length[:, None] * heading
     place, count = _densest(ends)

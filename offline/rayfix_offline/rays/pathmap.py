@@ -10,8 +10,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.rays.launch import turned
-from rayfix_offline.rays.pathprior import PathPrior, reflection_factors
+from rayfix_offline.rays.hits import turned
+from rayfix_offline.rays.pathprior import PathPrior, wall_factors
 from rayfix_offline.rays.rays import RaySet
 from rayfix_offline.rays.segments import SegmentArrays, Segments
 from rayfix_offline.rays.settings import PathKind
@@ -55,10 +55,10 @@ def fill_path_map(
         Threads; -1 for one per core. The map is the same with any number.
     """
     total = prior.total.reshape(-1)
-    factors = reflection_factors(segments, exponent)
+    factors = wall_factors(segments, exponent)
 
-    def fill(first: int, stop: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        keys, volume, strength = _fill(
+    def fill(first: int, stop: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        keys, sums = _fill(
             SegmentArrays.of(segments, rays.directions, factors, first, stop),
             rays.solid_angle[first:stop],
             exponent,
@@ -67,12 +67,12 @@ def fill_path_map(
             total,
         )
         used = keys >= 0
-        return keys[used], volume[used], strength[used]
+        return keys[used], sums[used]
 
     found = over_ray_ranges(fill, len(rays), jobs)
     keys, place = np.unique(np.concatenate([each[0] for each in found]), return_inverse=True)
-    volume = np.bincount(place, np.concatenate([each[1] for each in found]), len(keys))
-    strength = np.bincount(place, np.concatenate([each[2] for each in found]), len(keys))
+    sums = np.concatenate([each[1] for each in found])
+    volume, strength, excess, walls = (np.bincount(place, sums[:, n], len(keys)) for n in range(4))
     voxel, sequence = np.divmod(keys, len(segments.sequences.images))
     # Rays reach a little more or less of a voxel than there is of it: that is noise of their number.
     lit = np.minimum(volume / prior.free_volume.reshape(-1)[voxel], 1.0)
@@ -89,15 +89,17 @@ def fill_path_map(
     if field_of_view is not None:
         along = segments.sequences.mirrors[sequence] @ field_of_view.axis
         order = order[(np.einsum("ni,ni->n", along, apart) >= length * np.cos(field_of_view.half_angle))[order]]
-    voxel, sequence, weight = voxel[order], sequence[order], weight[order]
-    used, number = np.unique(sequence, return_inverse=True)
+    used, number = np.unique(sequence[order], return_inverse=True)
+    passes = bool(walls[order].any())
     return PathMap(
         origin=prior.origin,
         voxel_size=prior.voxel_size,
         shape=prior.total.shape,
-        offsets=np.concatenate([[0], np.cumsum(np.bincount(voxel, minlength=total.size))]),
+        offsets=np.concatenate([[0], np.cumsum(np.bincount(voxel[order], minlength=total.size))]),
         sequence=number.astype(np.int32),
-        weight=weight.astype(np.float32),
+        weight=weight[order].astype(np.float32),
+        excess=(excess / strength)[order].astype(np.float32) if passes else np.zeros(0, np.float32),
+        num_walls=np.rint(walls / strength)[order].astype(np.int8) if passes else np.zeros(0, np.int8),
         images=segments.sequences.images[used],
         mirrors=segments.sequences.mirrors[used],
         num_reflections=segments.sequences.num_reflections[used],
@@ -110,26 +112,22 @@ def _fill(rays: Any, solid_angle: Any, exponent: Any, least_share: Any, room: An
 
     Returns
     -------
-    keys : ndarray of int64
+    keys : ndarray of int64, shape (n,)
         A hash table of ``voxel * n_sequences + sequence``; -1 where it is empty.
-    volume : ndarray, m3
-        Integral of solid angle x length^2 over the parts of rays in the voxel.
-    strength : ndarray
-        The same times gain^beta.
+    sums : ndarray of shape (n, 4)
+        Integrals over the parts of rays in the voxel of solid angle x length^2: as it is [m3], times gain^beta, and
+        that times the excess length [m] and times the number of walls.
     """
     voxel, lengths, voxels = room.voxel_size, room.lengths, room.voxels
     num_sequences = len(rays.images)
     size = 1 << 16
-    keys, volume, strength = np.full(size, -1, np.int64), np.zeros(size), np.zeros(size)
+    keys, sums = np.full(size, -1, np.int64), np.zeros((size, 4))
     count = 0
-    for ray in range(rays.sequence.shape[0]):
-        for depth in range(rays.sequence.shape[1]):
-            seq = rays.sequence[ray, depth]
-            if seq < 0:
-                break
-            factor = rays.factors[ray, depth]
+    for ray in range(len(solid_angle)):
+        for segment in range(rays.offsets[ray], rays.offsets[ray + 1]):
+            seq = rays.sequence[segment]
             heading = turned(rays.mirrors, seq, rays.directions, ray)
-            begin, stop = rays.start[ray, depth], rays.end[ray, depth]
+            begin, stop = rays.start[segment], rays.end[segment]
             num_parts = walk(rays.images[seq], heading, begin, stop, room.origin, voxel, room.shape, lengths, voxels)
             for part in range(num_parts):
                 where = voxels[part]
@@ -137,21 +135,23 @@ def _fill(rays: Any, solid_angle: Any, exponent: Any, least_share: Any, room: An
                 if where < 0 or end <= begin:
                     continue
                 reach = max(0.5 * (begin + end), 0.5 * voxel)
-                gain = factor / power(reach * reach, exponent)
-                if gain < least_share * total[where]:
+                gain = rays.factors[segment] / power(reach * reach, exponent)
+                if gain <= 0.0 or not gain >= least_share * total[where]:
                     continue
                 if 2 * count >= size:
                     size *= 2
-                    keys, volume, strength = _grown(keys, volume, strength, size)
+                    keys, sums = _grown(keys, sums, size)
                 key = where * num_sequences + seq
                 slot = _slot(keys, key)
                 if keys[slot] < 0:
                     keys[slot] = key
                     count += 1
                 covered = solid_angle[ray] * (end**3 - begin**3) / 3.0
-                volume[slot] += covered
-                strength[slot] += covered * gain
-    return keys, volume, strength
+                sums[slot, 0] += covered
+                sums[slot, 1] += covered * gain
+                sums[slot, 2] += covered * gain * rays.excess[segment]
+                sums[slot, 3] += covered * gain * rays.num_walls[segment]
+    return keys, sums
 
 
 @numba.njit(cache=True, nogil=True)
@@ -165,11 +165,12 @@ def _slot(keys: Any, key: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _grown(keys: Any, volume: Any, strength: Any, size: Any) -> Any:
+def _grown(keys: Any, sums: Any, size: Any) -> Any:
     """Move a hash table to a larger one."""
-    new_keys, new_volume, new_strength = np.full(size, -1, np.int64), np.zeros(size), np.zeros(size)
+    new_keys, new_sums = np.full(size, -1, np.int64), np.zeros((size, sums.shape[1]))
     for n in range(len(keys)):
         if keys[n] >= 0:
             slot = _slot(new_keys, keys[n])
-            new_keys[slot], new_volume[slot], new_strength[slot] = keys[n], volume[n], strength[n]
-    return new_keys, new_volume, new_strength
+            new_keys[slot] = keys[n]
+            new_sums[slot] = sums[n]
+    return new_keys, new_sums

@@ -15,8 +15,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rayfix_offline.rays.launch import turned
-from rayfix_offline.rays.pathprior import PathPrior, reflection_factors
+from rayfix_offline.rays.hits import turned
+from rayfix_offline.rays.pathprior import PathPrior, wall_factors
 from rayfix_offline.rays.rays import RaySet
 from rayfix_offline.rays.segments import SegmentArrays, Segments
 from rayfix_offline.rays.settings import RaySettings
@@ -34,8 +34,12 @@ class Pieces:
     mass : ndarray of shape (n_pieces,), m3 / sr
         Integral over the length of s^2 pi times the hat function.
     mean : ndarray of shape (n_pieces,), m
-        Mean path length under that weight.
+        Mean geometric path length under that weight.
     variance : ndarray of shape (n_pieces,), m2
+    excess : ndarray of float32, shape (n_pieces,), m
+        What walls add to the measured length.
+    num_walls : ndarray of int8, shape (n_pieces,)
+        Walls passed before.
     """
 
     offsets: NDArray[np.int64]
@@ -44,6 +48,8 @@ class Pieces:
     mass: NDArray[np.float64]
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
+    excess: NDArray[np.float32]
+    num_walls: NDArray[np.int8]
 
     @cached_property
     def num_slices(self) -> int:
@@ -62,6 +68,8 @@ class Pieces:
             mass=self.mass[take],
             mean=self.mean[take],
             variance=self.variance[take],
+            excess=self.excess[take],
+            num_walls=self.num_walls[take],
         )
 
 
@@ -73,6 +81,8 @@ class _PieceArrays(NamedTuple):
     mass: NDArray[np.float64]
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
+    excess: NDArray[np.float32]
+    num_walls: NDArray[np.int8]
 
 
 def cut_pieces(
@@ -102,7 +112,7 @@ def cut_pieces(
         Threads; -1 for one per core. The pieces are the same with any number.
     """
     nodes = slice_nodes(float(segments.end.max(initial=0.0)), slice_ratio, first_node)
-    counts = _count(segments.sequence, segments.start, segments.end, nodes)
+    counts = _count(segments.offsets, segments.start, segments.end, nodes)
     offsets = np.concatenate([[0], np.cumsum(counts)])
     total = int(offsets[-1])
     pieces = Pieces(
@@ -112,8 +122,10 @@ def cut_pieces(
         mass=np.zeros(total),
         mean=np.zeros(total),
         variance=np.zeros(total),
+        excess=np.empty(total, np.float32),
+        num_walls=np.empty(total, np.int8),
     )
-    factors = reflection_factors(segments, exponent)
+    factors = wall_factors(segments, exponent)
 
     def cut(first: int, stop: int) -> None:
         _cut(
@@ -125,10 +137,10 @@ def cut_pieces(
             prior.total.reshape(-1),
             nodes,
             offsets[first:stop],
-            _PieceArrays(pieces.sequence, pieces.slice, pieces.mass, pieces.mean, pieces.variance),
+            _PieceArrays(**{name: getattr(pieces, name) for name in _PieceArrays._fields}),
         )
 
-    over_ray_ranges(cut, len(rays), jobs)
+    over_ray_ranges(cut, len(segments.offsets) - 1, jobs)
     return pieces
 
 
@@ -148,17 +160,13 @@ def _last_slice(length: Any, nodes: Any, at_least: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _count(sequence: Any, start: Any, end: Any, nodes: Any) -> Any:
-    """Count the pieces of each ray: one for each slice that overlaps a segment."""
-    counts = np.zeros(sequence.shape[0], np.int64)
-    for ray in range(sequence.shape[0]):
-        last = 0
-        for depth in range(sequence.shape[1]):
-            if sequence[ray, depth] < 0:
-                break
-            first = max(0, _last_slice(start[ray, depth], nodes, last) - 1)
-            last = _last_slice(end[ray, depth], nodes, first)
-            counts[ray] += last - first + 1
+def _count(segments: Any, start: Any, end: Any, nodes: Any) -> Any:
+    """Count the pieces of each ray: one for each slice that overlaps a segment. ``segments`` are the rays' offsets."""
+    counts = np.zeros(len(segments) - 1, np.int64)
+    for ray in range(len(counts)):
+        for segment in range(segments[ray], segments[ray + 1]):
+            first = max(0, _last_slice(start[segment], nodes, 0) - 1)
+            counts[ray] += _last_slice(end[segment], nodes, first) - first + 1
     return counts
 
 
@@ -191,19 +199,18 @@ def _cut(
         Of all rays; filled in place.
     """
     lengths, voxels = room.lengths, room.voxels
-    for ray in range(rays.sequence.shape[0]):
+    for ray in range(len(offsets)):
         at = offsets[ray]
-        last = 0
-        for depth in range(rays.sequence.shape[1]):
-            seq = rays.sequence[ray, depth]
-            if seq < 0:
-                break
-            begin, stop = rays.start[ray, depth], rays.end[ray, depth]
-            first = max(0, _last_slice(begin, nodes, last) - 1)
+        for segment in range(rays.offsets[ray], rays.offsets[ray + 1]):
+            seq = rays.sequence[segment]
+            begin, stop = rays.start[segment], rays.end[segment]
+            first = max(0, _last_slice(begin, nodes, 0) - 1)
             last = _last_slice(stop, nodes, first)
             for n in range(first, last + 1):
                 out.sequence[at + n - first] = seq
                 out.slice[at + n - first] = n
+                out.excess[at + n - first] = rays.excess[segment]
+                out.num_walls[at + n - first] = rays.num_walls[segment]
             heading = turned(rays.mirrors, seq, rays.directions, ray)
             num_parts = walk(
                 rays.images[seq], heading, begin, stop, room.origin, room.voxel_size, room.shape, lengths, voxels
@@ -216,8 +223,8 @@ def _cut(
                 # The path's probability times length^(2 beta), before it is limited to 1. It is 0 outside of the map,
                 # and for a path so weak that its gain^beta is 0.
                 probability = 0.0
-                if voxels[part] >= 0 and rays.factors[ray, depth] > 0.0:
-                    probability = rays.factors[ray, depth] / total[voxels[part]]  # infinite where the map is 0
+                if voxels[part] >= 0 and rays.factors[segment] > 0.0:
+                    probability = rays.factors[segment] / total[voxels[part]]  # infinite where the map is 0
                 while length < lengths[part + 1]:
                     reach = min(lengths[part + 1], nodes[peak])
                     for node, node_weight in GAUSS:

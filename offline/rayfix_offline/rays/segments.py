@@ -1,6 +1,7 @@
 """Straight segments of rays, and the reflection sequences that they belong to."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 @dataclass(frozen=True, kw_only=True)
 class Sequences:
     """Reflection sequences of rays; sequence 0 is the direct path.
+
+    Walls that a ray passes do not turn it, and leave its sequence as it is.
 
     Attributes
     ----------
@@ -33,26 +36,47 @@ class Sequences:
 
 @dataclass(frozen=True, kw_only=True)
 class Segments:
-    """Straight segments of rays, one column for each number of reflections.
+    """Straight segments of rays. Those of ray r are ``offsets[r]`` to ``offsets[r + 1]``, parents before children.
+
+    A ray is a tree: at a wall it is mirrored, and goes on straight if the wall lets signals through.
 
     Attributes
     ----------
-    sequence : ndarray of int32, shape (n_rays, max_reflections + 1)
-        Reflection sequence of the segment, -1 if the ray has ended before.
-    start, end : ndarray of that shape, m
-        Path lengths at which the segment begins and ends.
-    log_gain : ndarray of that shape
-        Logarithm to base 10 of the fraction of the power that remains after the reflections before the segment.
+    offsets : ndarray of int64, shape (n_rays + 1,)
+    sequence : ndarray of int32, shape (n_segments,)
+        Reflection sequence.
+    start, end : ndarray of shape (n_segments,), m
+        Geometric path lengths at which the segment begins and ends.
+    log_gain : ndarray of shape (n_segments,)
+        Logarithm to base 10 of the fraction of the power that remains after the walls before the segment.
+    excess : ndarray of shape (n_segments,), m
+        Length that the walls passed before the segment add to the measured one.
+    num_walls : ndarray of int8, shape (n_segments,)
+        Number of walls passed before the segment.
+    max_reflections : int
+        Largest number of reflections that was allowed.
     lost_ray_share : float
-        Fraction of the rays that left the scene instead of hitting a surface.
+        Fraction of the rays that left the scene instead of hitting a surface, without passing a wall.
+    cut_power_share : float
+        Fraction of the power whose rays ended because they were too weak or had passed too many walls.
     """
 
+    offsets: NDArray[np.int64]
     sequence: NDArray[np.int32]
     start: NDArray[np.float64]
     end: NDArray[np.float64]
     log_gain: NDArray[np.float64]
+    excess: NDArray[np.float64]
+    num_walls: NDArray[np.int8]
     sequences: Sequences
+    max_reflections: int
     lost_ray_share: float
+    cut_power_share: float
+
+    @cached_property
+    def ray(self) -> NDArray[np.int64]:
+        """Ray of each segment, shape (n_segments,)."""
+        return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
 
 
 class SegmentArrays(NamedTuple):
@@ -60,21 +84,27 @@ class SegmentArrays(NamedTuple):
 
     Attributes
     ----------
-    sequence, start, end
+    offsets : ndarray of int64, shape (n_rays + 1,)
+        Segments of each ray in the arrays of all segments.
+    sequence, start, end, excess, num_walls
         As in :class:`Segments`.
-    images, mirrors
+    images, mirrors, num_reflections
         As in :class:`Sequences`.
     directions : ndarray of shape (n_rays, 3)
         Launch directions.
-    factors : ndarray of shape (n_rays, max_reflections + 1)
-        Factor of gain^beta due to the reflections before a segment.
+    factors : ndarray of shape (n_segments,)
+        Factor of gain^beta due to the walls before a segment.
     """
 
+    offsets: NDArray[np.int64]
     sequence: NDArray[np.int32]
     start: NDArray[np.float64]
     end: NDArray[np.float64]
+    excess: NDArray[np.float64]
+    num_walls: NDArray[np.int8]
     images: NDArray[np.float64]
     mirrors: NDArray[np.float64]
+    num_reflections: NDArray[np.int8]
     directions: NDArray[np.float64]
     factors: NDArray[np.float64]
 
@@ -84,11 +114,15 @@ class SegmentArrays(NamedTuple):
     ) -> "SegmentArrays":
         """Segments of the rays from ``first`` to before ``stop``."""
         return cls(
-            sequence=segments.sequence[first:stop],
-            start=segments.start[first:stop],
-            end=segments.end[first:stop],
+            offsets=segments.offsets[first : stop + 1],
+            sequence=segments.sequence,
+            start=segments.start,
+            end=segments.end,
+            excess=segments.excess,
+            num_walls=segments.num_walls,
             images=segments.sequences.images,
             mirrors=segments.sequences.mirrors,
+            num_reflections=segments.sequences.num_reflections,
             directions=directions[first:stop],
-            factors=factors[first:stop],
+            factors=factors,
         )

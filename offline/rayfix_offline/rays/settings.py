@@ -19,6 +19,13 @@ class RaySettings:
         Standard deviation of a window divided by the spacing of its cells.
     mirror_offset : float
         A reflected ray starts at this times (1 + largest coordinate in m) from its mirror.
+    max_walls : int
+        Largest number of walls that a path passes.
+    straight_floor_db, mirrored_floor_db : float
+        Where walls let signals through, paths end that lose more than this at walls: those without a reflection, and
+        others.
+    max_inner_hits : int
+        Largest number of faces of other objects that a path meets within a solid wall.
     first_node : float, m
         Path length of the first slice node; shorter lengths belong to the first slice.
     slice_ratio : float
@@ -36,6 +43,10 @@ class RaySettings:
     rays_per_window: float = 3.0
     cells_per_window: float = 0.8
     mirror_offset: float = 1e-5
+    max_walls: int = 8
+    straight_floor_db: float = 60.0
+    mirrored_floor_db: float = 40.0
+    max_inner_hits: int = 16
     first_node: float = 0.25
     slice_ratio: float = 1.2
     prior_refinement: int = 2

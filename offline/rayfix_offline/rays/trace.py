@@ -15,7 +15,8 @@ from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments, Sequences
 from rayfix_offline.rays.settings import RaySettings
 from rayfix_offline.rays.surface_sequences import surface_sequences
-from rayfix_offline.scene.materials import ReflectionSettings, Reflectivity, constant_reflectivity, itu_reflectivity
+from rayfix_offline.scene.materials import ReflectionSettings
+from rayfix_offline.scene.walls import Walls, walls_of
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin.twin import Twin
 from rayfix_tables.geometry.mounting import board_to_scene
@@ -57,18 +58,22 @@ class StationTrace:
         Fraction of the rays that left the scene instead of hitting a surface.
     coverage : tuple of float
         Fraction of the free space that is reached with at most 0, 1, 2, ... reflections.
+    wall_coverage, cut_power_share
+        As in :class:`~rayfix_tables.part.StationPart`.
     paths : PathMap
     """
 
     finest: LevelRays
     lost_ray_share: float
     coverage: tuple[float, ...]
+    wall_coverage: tuple[float, ...]
+    cut_power_share: float
     paths: PathMap
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Return the statistics of the launch and the path map as the arrays of a shard."""
-        statistics = {"lost_ray_share": np.array(self.lost_ray_share), "coverage": np.array(self.coverage)}
-        return statistics | self.paths.to_arrays()
+        names = ("lost_ray_share", "coverage", "wall_coverage", "cut_power_share")
+        return {name: np.array(getattr(self, name)) for name in names} | self.paths.to_arrays()
 
 
 def level_grid(window: float, *, cells_per_window: float = RaySettings.cells_per_window) -> AngularGrid:
@@ -84,18 +89,9 @@ def prior_spacing(twin: Twin, settings: RaySettings | None = None) -> float:
     return max(settings.prior_spacing, wanted)
 
 
-def reflectivity_of(site: SiteFile, twin: Twin, settings: ReflectionSettings | None = None) -> Reflectivity:
-    """Return the reflectivity of the triangles of a site's scene."""
-    propagation, scene = site.propagation, twin.scene
-    if propagation.reflection == "constant":
-        return constant_reflectivity(len(scene.faces), loss_db=propagation.reflection_loss_db)
-    return itu_reflectivity(
-        scene.face_materials,
-        scene.materials,
-        carrier_ghz=propagation.carrier_ghz,
-        loss_db=propagation.reflection_loss_db,
-        settings=settings,
-    )
+def scene_walls(site: SiteFile, twin: Twin, settings: ReflectionSettings | None = None) -> Walls:
+    """Return what the triangles of a site's scene reflect and let through."""
+    return walls_of(site, twin.scene, twin.solid, twin.outward, settings)
 
 
 def trace_station(
@@ -122,7 +118,7 @@ def trace_station(
     window = float(np.deg2rad(site.table.windows_deg[0]))
     spacing = window / settings.rays_per_window
     widest = prior_spacing(twin, settings)
-    reflectivity = reflectivity_of(site, twin, reflection)
+    walls = scene_walls(site, twin, reflection)
 
     def launched(spacing: float, *seed: int) -> tuple[RaySet, Segments]:
         return launch_rays(
@@ -131,8 +127,8 @@ def trace_station(
             twin,
             spacing,
             np.random.default_rng([site.table.seed, *seed]),
-            reflectivity=reflectivity,
-            mirror_offset=settings.mirror_offset,
+            walls=walls,
+            settings=settings,
         )
 
     name = int.from_bytes(hashlib.sha256(station.id.encode()).digest()[:8], "big")
@@ -180,7 +176,12 @@ def trace_station(
         jobs=jobs,
     )
     return StationTrace(
-        finest=finest, lost_ray_share=prior_segments.lost_ray_share, coverage=prior.coverage, paths=paths
+        finest=finest,
+        lost_ray_share=prior_segments.lost_ray_share,
+        coverage=prior.coverage,
+        wall_coverage=prior.wall_coverage,
+        cut_power_share=segments.cut_power_share,
+        paths=paths,
     )
 
 
@@ -191,8 +192,8 @@ def launch_rays(
     spacing: float,
     rng: np.random.Generator,
     *,
-    reflectivity: Reflectivity | None = None,
-    mirror_offset: float = RaySettings.mirror_offset,
+    walls: Walls | None = None,
+    settings: RaySettings | None = None,
 ) -> tuple[RaySet, Segments]:
     """Launch a station's rays.
 
@@ -200,10 +201,9 @@ def launch_rays(
     ----------
     spacing : float, rad
         Between neighbouring rays.
-    reflectivity : Reflectivity, optional
+    walls : Walls, optional
         The site's when left out.
-    mirror_offset : float
-        See :func:`~rayfix_offline.rays.launch.launch`.
+    settings : RaySettings, optional
     """
     rays = sample_rays(spacing, rng)
     segments = launch(
@@ -211,10 +211,10 @@ def launch_rays(
         rays.directions,
         engine=twin.engine,
         planes=twin.planes,
-        reflectivity=reflectivity if reflectivity is not None else reflectivity_of(site, twin),
+        walls=walls if walls is not None else scene_walls(site, twin),
         bounds=twin.scene.bounds,
         max_reflections=site.propagation.max_reflections,
         max_path_length=site.propagation.max_path_length_m,
-        mirror_offset=mirror_offset,
+        settings=settings,
     )
     return rays, segments

@@ -1,11 +1,12 @@
 """Reflection by building materials: permittivities of ITU-R P.2040-3 and Fresnel's coefficients.
 
-A wall is modelled as a half space: reflections from its far side are neglected. The power is averaged over both
-polarisations, because the orientation of the transmitter's antenna is not known.
+A wall of unknown thickness is modelled as a half space: reflections from its far side are neglected; for slabs see
+:mod:`~rayfix_offline.scene.slabs`. The power is averaged over both polarisations, because the orientation of the
+transmitter's antenna is not known.
 """
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -76,73 +77,6 @@ ITU_MATERIALS = {
 """Table 3 of ITU-R P.2040-3."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Reflectivity:
-    """Reflected power of each triangle.
-
-    Attributes
-    ----------
-    permittivity : ndarray of complex, shape (n_faces,)
-        Complex relative permittivity of each triangle; NaN if the constant loss applies.
-    loss_db : float
-        The constant loss.
-    settings : ReflectionSettings
-    """
-
-    permittivity: NDArray[np.complex128]
-    loss_db: float
-    settings: ReflectionSettings = field(default_factory=ReflectionSettings)
-
-    def log_gain(self, faces: NDArray[np.int32], cos_incidence: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Logarithm to base 10 of the reflected fraction of the power.
-
-        Parameters
-        ----------
-        faces : ndarray of int, shape (n,)
-        cos_incidence : ndarray of shape (n,)
-            Cosine of the angle between ray and normal, in [0, 1].
-        """
-        permittivity = self.permittivity[faces]
-        known = np.isfinite(permittivity)
-        out = np.full(len(faces), -0.1 * self.loss_db)
-        if known.any():
-            grazing = self.settings.grazing_cosine
-            power = fresnel_power(cos_incidence[known], permittivity[known], grazing_cosine=grazing)
-            out[known] = np.log10(np.maximum(power, self.settings.min_power))
-        return out
-
-    def power(self, faces: NDArray[np.int32], cos_incidence: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Reflected fraction of the power; see :meth:`log_gain`."""
-        return np.asarray(10.0 ** self.log_gain(faces, cos_incidence))
-
-
-def constant_reflectivity(num_faces: int, *, loss_db: float) -> Reflectivity:
-    """Return the same loss for all triangles, whatever their material."""
-    return Reflectivity(permittivity=np.full(num_faces, np.nan, np.complex128), loss_db=loss_db)
-
-
-def itu_reflectivity(
-    face_materials: NDArray[np.int16],
-    materials: tuple[str, ...],
-    *,
-    carrier_ghz: float,
-    loss_db: float,
-    settings: ReflectionSettings | None = None,
-) -> Reflectivity:
-    """Return the reflectivity of triangles according to their materials.
-
-    Parameters
-    ----------
-    face_materials : ndarray of int, shape (n_faces,)
-        Index into ``materials``; -1 for none.
-    loss_db : float
-        Loss of triangles without a material, or with one that :func:`complex_permittivity` does not know.
-    settings : ReflectionSettings, optional
-    """
-    permittivity = face_permittivity(face_materials, materials, carrier_ghz)
-    return Reflectivity(permittivity=permittivity, loss_db=loss_db, settings=settings or ReflectionSettings())
-
-
 def face_permittivity(
     face_materials: NDArray[np.int16], materials: tuple[str, ...], carrier_ghz: float
 ) -> NDArray[np.complex128]:
@@ -159,10 +93,15 @@ def itu_name(name: str) -> str | None:
     Sionna RT and Blender's Mitsuba exporter write ``itu_concrete``, ``itu-concrete`` or ``mat-itu_concrete``; Blender
     numbers copies, as in ``itu_concrete.001``.
     """
+    plain = plain_name(name)
+    return plain if plain in ITU_MATERIALS else None
+
+
+def plain_name(name: str) -> str:
+    """Name of a material without the prefixes and numbers of copies that exporters add; see :func:`itu_name`."""
     plain = re.sub(r"\.\d+$", "", name.strip().lower())
     plain = re.sub(r"[-_\s]+", "_", plain)
-    plain = plain.removeprefix("mat_").removeprefix("itu_")
-    return plain if plain in ITU_MATERIALS else None
+    return plain.removeprefix("mat_").removeprefix("itu_")
 
 
 def complex_permittivity(name: str, carrier_ghz: float) -> complex | None:
@@ -182,12 +121,13 @@ def complex_permittivity(name: str, carrier_ghz: float) -> complex | None:
     plain = itu_name(name)
     for row in ITU_MATERIALS[plain] if plain else ():
         if row.lowest_ghz <= carrier_ghz <= row.highest_ghz:
-            conductivity = row.c * carrier_ghz**row.d
-            return complex(
-                row.a * carrier_ghz**row.b,
-                -conductivity / (2.0 * np.pi * carrier_ghz * 1e9 * VACUUM_PERMITTIVITY),
-            )
+            return with_conductivity(row.a * carrier_ghz**row.b, row.c * carrier_ghz**row.d, carrier_ghz)
     return None
+
+
+def with_conductivity(permittivity: float, conductivity: float, carrier_ghz: float) -> complex:
+    """Complex relative permittivity of a real one and a conductivity in S/m."""
+    return complex(permittivity, -conductivity / (2.0 * np.pi * carrier_ghz * 1e9 * VACUUM_PERMITTIVITY))
 
 
 def fresnel_power(

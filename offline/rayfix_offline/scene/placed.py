@@ -24,6 +24,8 @@ class Placed:
         Index into ``materials``; -1 for none.
     transform : ndarray of shape (4, 4)
         From the object's frame to the scene's.
+    thickness : float, m
+        Of the object's material, if the file states it, whatever the file's unit; else NaN.
     """
 
     name: str
@@ -32,6 +34,7 @@ class Placed:
     materials: tuple[str, ...] = ()
     face_materials: NDArray[np.int64]
     transform: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    thickness: float = np.nan
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -72,6 +72,8 @@ class Scene:
         Whether the file itself states the upward axis.
     remarks : tuple of Remark
         What the file's reader left out or changed.
+    face_thickness : ndarray of shape (n_faces,), optional, m
+        Thickness of the material of each triangle, NaN where the file does not state it; None if it states none.
     """
 
     vertices: NDArray[np.float64]
@@ -83,6 +85,7 @@ class Scene:
     num_degenerate: int = 0
     says_up: bool = False
     remarks: tuple[Remark, ...] = ()
+    face_thickness: NDArray[np.float64] | None = None
 
     @cached_property
     def triangles(self) -> NDArray[np.float64]:
@@ -94,6 +97,16 @@ class Scene:
         """Low and high corner, shape (2, 3), m."""
         used = self.vertices[np.unique(self.faces)]
         return np.stack([used.min(axis=0), used.max(axis=0)])
+
+    def only(self, faces: NDArray[np.bool_]) -> "Scene":
+        """Return the scene with some of its triangles, given by a mask of shape (n_faces,)."""
+        return replace(
+            self,
+            faces=self.faces[faces],
+            face_materials=self.face_materials[faces],
+            face_objects=self.face_objects[faces],
+            face_thickness=None if self.face_thickness is None else self.face_thickness[faces],
+        )
 
     def moved(self, by: NDArray[np.float64]) -> "Scene":
         """Return the scene translated by a vector of shape (3,), m."""
@@ -227,6 +240,7 @@ def _gather(path: Path, objects: list[Placed], contents: Contents, *, scale: flo
     all_faces = np.concatenate(faces)
     a, b, c = (all_vertices[all_faces[:, i]] for i in range(3))
     keep = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 2.0 * _MIN_AREA
+    thickness = np.repeat([each.thickness for each in objects], [len(each.faces) for each in objects])[keep]
     return Scene(
         vertices=all_vertices,
         faces=all_faces[keep].astype(np.int32),
@@ -237,4 +251,5 @@ def _gather(path: Path, objects: list[Placed], contents: Contents, *, scale: flo
         num_degenerate=int(np.count_nonzero(~keep)),
         says_up=contents.up is not None,
         remarks=contents.remarks,
+        face_thickness=thickness if np.isfinite(thickness).any() else None,
     )

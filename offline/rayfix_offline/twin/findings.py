@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.scene.materials import ITU_MATERIALS, complex_permittivity, itu_name
 from rayfix_offline.scene.scene import METRES_PER_UNIT, Scene
+from rayfix_offline.scene.walls import section_of
 from rayfix_offline.site import SiteFile, StationSection
 from rayfix_offline.twin.cleaning import Duplicates
 from rayfix_offline.twin.enclosures import Enclosures
@@ -167,17 +168,72 @@ def material_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
         )
 
 
-def partition_findings(site: SiteFile, scene: Scene, partitions: Partitions) -> Iterator[Finding]:
-    """Warn of thin walls: they block all rays, but not signals of low frequencies."""
-    if site.propagation.carrier_ghz >= OPAQUE_ABOVE or not partitions.faces.any():
+def wall_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
+    """Find what is known of walls but not used."""
+    of_scene = {section_of(site, name) for name in scene.materials}
+    unused = [f"'{name}'" for name in site.materials if name not in of_scene]
+    if unused:
+        names = ", ".join(f"'{name}'" for name in scene.materials) or "no materials"
+        yield warning(
+            "material",
+            f"the site file describes {_listed(unused)}, which the scene does not have",
+            f"give the sections the names of the scene's materials: {names}",
+        )
+    carrier = site.propagation.carrier_ghz
+    for key, section in site.materials.items():
+        if section.itu is not None and itu_name(section.itu) is None:
+            yield error(
+                "material",
+                f"materials.{key}.itu = '{section.itu}' is not in ITU-R P.2040",
+                f"it has {', '.join(ITU_MATERIALS)}",
+            )
+            continue
+        needs = section.thickness_m is not None and section.permittivity is None
+        if not needs or section.transmission_loss_db is not None:
+            continue
+        if itu_name(section.itu or key) is None:
+            yield error(
+                "material",
+                f"materials.{key} has a thickness but no permittivity",
+                "add itu, permittivity or transmission_loss_db",
+            )
+        elif complex_permittivity(section.itu or key, carrier) is None:
+            yield warning(
+                "material",
+                f"the permittivity of '{key}' is not known at carrier_ghz = {carrier:g}, and its walls let nothing "
+                "through",
+                "give permittivity and conductivity_s_m, or transmission_loss_db",
+            )
+    if scene.face_thickness is None or site.propagation.reflection == "itu" or not site.propagation.transmission:
         return
-    walls = [scene.objects[n] for n in np.unique(scene.face_objects[partitions.faces])]
+    stated = np.unique(scene.face_materials[np.isfinite(scene.face_thickness)])
+    silent = [f"'{scene.materials[n]}'" for n in stated if n >= 0 and section_of(site, scene.materials[n]) is None]
+    if silent:
+        yield warning(
+            "material",
+            f'the scene states the thickness of {_listed(silent)}, but with reflection = "constant" materials are not '
+            "looked up, and nothing passes these walls",
+            'set reflection = "itu", or describe the materials in the site file',
+        )
+
+
+def partition_findings(
+    site: SiteFile, scene: Scene, partitions: Partitions, passable: NDArray[np.bool_]
+) -> Iterator[Finding]:
+    """Warn of thin walls that block all rays, but not signals of low frequencies."""
+    faces = partitions.faces & ~passable
+    if site.propagation.carrier_ghz >= OPAQUE_ABOVE or not faces.any():
+        return
+    walls = [scene.objects[n] for n in np.unique(scene.face_objects[faces])]
     yield warning(
         "thin partition",
         f"walls thinner than {THICKNESS:g} m, not known to be of concrete, brick or metal, divide the free space into "
         f"{partitions.rooms} rooms: {_listed(walls)}; at {site.propagation.carrier_ghz:g} GHz signals pass thin "
-        "partitions, but rays pass no wall",
-        "leave thin partitions and doors out of the mesh, and name the material of walls of concrete, brick or metal",
+        "partitions, but rays pass no wall of unknown material or thickness",
+        "give their materials a thickness_m in [materials.NAME] of the site file"
+        + ("" if site.propagation.transmission else " and set transmission = true")
+        + ", or leave thin partitions and doors out of the mesh; name the material of walls of concrete, brick or "
+        "metal",
     )
 
 

@@ -34,11 +34,4 @@ class Mesh:
         """Return the mesh without some triangles, given by a mask of shape (n_faces,)."""
         if not faces.any():
             return self
-        scene = self.scene
-        left = replace(
-            scene,
-            faces=scene.faces[~faces],
-            face_materials=scene.face_materials[~faces],
-            face_objects=scene.face_objects[~faces],
-        )
-        return replace(self, scene=left)
+        return replace(self, scene=self.scene.only(~faces))

@@ -1,4 +1,4 @@
-"""Thin partitions: walls that signals penetrate, but rays do not.
+"""Thin partitions: walls that signals penetrate, and rays only where material and thickness are known.
 
 Samples of upright triangles are thin where there is free space on both sides. Those from floor to ceiling are walls in
 a map of the floor. They are partitions if the map has more rooms with them than without them, after closing gaps as

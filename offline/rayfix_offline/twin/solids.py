@@ -102,6 +102,39 @@ def split_parts(mesh: Mesh) -> tuple[Part, ...]:
     )
 
 
+def solid_faces(
+    mesh: Mesh, parts: Sequence[Part], solids: Sequence[bool] | NDArray[np.bool_]
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Find the solid that each triangle belongs to, and the triangles' normals.
+
+    Parameters
+    ----------
+    solids : sequence of bool, length n_parts
+        Which parts are solids.
+
+    Returns
+    -------
+    solid : ndarray of int32, shape (n_faces,)
+        Index of the part, -1 for sheets.
+    outward : ndarray of shape (n_faces, 3)
+        Unit normals, those of solids out of them.
+    """
+    a, b, c = (mesh.scene.triangles[:, i] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    label = np.empty(len(normals), np.int64)
+    solid = np.full(len(normals), -1, np.int32)
+    outwards = np.ones(len(normals))
+    for n, part in enumerate(parts):
+        label[part.faces] = n
+        if solids[n]:
+            solid[part.faces] = n
+            outwards[part.faces] = 1.0 if part.volume > 0.0 else -1.0
+    if any(is_solid and not part.consistent for part, is_solid in zip(parts, solids, strict=True)):
+        outwards[mesh.topology.turned(label) & (solid >= 0)] *= -1.0
+    return solid, normals * outwards[:, None]
+
+
 def _names(scene: Scene, label: NDArray[np.int64], count: int) -> list[str]:
     """Names of parts: the object of most of their triangles, numbered if it has several parts."""
     pairs, uses = np.unique(label * len(scene.objects) + scene.face_objects, return_counts=True)

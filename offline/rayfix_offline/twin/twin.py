@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from rayfix_offline.scene.engine import FAR, EmbreeEngine, RayEngine
 from rayfix_offline.scene.room import room_scene, wall_remarks
 from rayfix_offline.scene.scene import Scene, load_scene
+from rayfix_offline.scene.walls import walls_of
 from rayfix_offline.site import OFF_WALL, SiteFile
 from rayfix_offline.twin.cleaning import find_duplicates
 from rayfix_offline.twin.enclosures import find_enclosures
@@ -21,12 +22,13 @@ from rayfix_offline.twin.findings import (
     partition_findings,
     size_findings,
     station_findings,
+    wall_findings,
 )
 from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.partitions import find_partitions
 from rayfix_offline.twin.planes import Planes, merge_coplanar
 from rayfix_offline.twin.settings import TwinSettings
-from rayfix_offline.twin.solids import map_free_space, sealed_space, split_parts
+from rayfix_offline.twin.solids import map_free_space, sealed_space, solid_faces, split_parts
 from rayfix_offline.twin.surfaces import join_facets
 from rayfix_tables.errors import SceneError
 from rayfix_tables.freespace import FreeSpace
@@ -45,11 +47,17 @@ class Twin:
         The scene in the table's frame, which is relative to ``origin``.
     origin : ndarray of shape (3,), m
         Origin of the table's frame in the frame of the scene file; zero except for scenes on map coordinates.
+    solid : ndarray of int32, shape (n_faces,)
+        Closed part, no building, that each triangle belongs to; -1 for sheets and shells.
+    outward : ndarray of shape (n_faces, 3)
+        Unit normals of the triangles, of solids the outward ones.
     """
 
     site: SiteFile
     scene: Scene
     origin: NDArray[np.float64]
+    solid: NDArray[np.int32]
+    outward: NDArray[np.float64]
     planes: Planes
     engine: RayEngine
     free_space: FreeSpace
@@ -94,9 +102,11 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
     scene, parts = mesh.scene, split_parts(mesh)
     stations = np.array([station.position_m for station in site.stations])
     enclosures = find_enclosures(scene, parts, stations, settings)
+    solids = [part.closed and not shell for part, shell in zip(parts, enclosures.enclosing, strict=True)]
+    solid, outward = solid_faces(mesh, parts, solids)
     free_space = map_free_space(
         scene,
-        solids=[part for part, shell in zip(parts, enclosures.enclosing, strict=True) if part.closed and not shell],
+        solids=[part for part, is_solid in zip(parts, solids, strict=True) if is_solid],
         rooms=[part for part, is_room in zip(parts, enclosures.rooms, strict=True) if is_room],
         voxel_size=settings.voxel_size,
         max_voxels=settings.max_voxels,
@@ -110,7 +120,13 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
         *file_findings(scene),
         *mesh_findings(scene, duplicates, [part.moved(origin) for part in parts], enclosures),
         *material_findings(site, scene),
-        *partition_findings(site, scene, find_partitions(scene, free_space, closed=closed)),
+        *wall_findings(site, scene),
+        *partition_findings(
+            site,
+            scene,
+            find_partitions(scene, free_space, closed=closed),
+            walls_of(site, scene, solid, outward).passable,
+        ),
         *station_findings(site, scene, parts, enclosures, touch=settings.touch, origin=origin),
     ]
     if not free_space.free.any():
@@ -121,6 +137,8 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
         site=site,
         scene=scene,
         origin=origin,
+        solid=solid,
+        outward=outward,
         planes=join_facets(mesh, planes, surface_angle=settings.surface_angle, facet_size=settings.facet_size),
         engine=EmbreeEngine(scene.triangles),
         free_space=free_space,

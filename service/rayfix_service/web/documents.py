@@ -24,6 +24,7 @@ class ViewerSettings(BaseModel):
 
     simulation: bool = Field(description="whether POST /v1/simulations answers")
     max_reflections: int = Field(description="largest number of reflections of a path in the table")
+    open_materials: list[str] = Field(description="materials of the scene that let signals through")
 
 
 class CellSummary(BaseModel):
@@ -45,6 +46,7 @@ class ComponentSummary(BaseModel):
     path_length_m: float
     path_length_stdev_m: float
     num_reflections: int = Field(description="reflections of the path that carries most of the component")
+    num_walls: int = Field(description="walls that this path passes")
 
 
 class MixtureDocument(BaseModel):
@@ -62,6 +64,7 @@ class MixtureDocument(BaseModel):
     num_components: int = Field(description="number of components of all these cells")
     components: list[ComponentSummary] = Field(description="the most probable ones")
     by_reflections: list[float] = Field(description="probability of 0, 1, ... reflections over all components")
+    by_walls: list[float] = Field(description="probability that 0, 1, ... walls are passed")
 
 
 class LevelCoverage(BaseModel):
@@ -78,6 +81,10 @@ class CoverageDocument(BaseModel):
 
     station_id: str
     coverage: list[float] = Field(description="fraction of the free space reached with at most 0, 1, ... reflections")
+    wall_coverage: list[float] = Field(
+        description="fraction of the free space that straight paths through at most 0, 1, ... walls reach; empty where "
+        "no wall lets signals through"
+    )
     levels: list[LevelCoverage] = Field(description="finest first")
 
 
@@ -108,6 +115,7 @@ class PathSummary(BaseModel):
     zenith_deg: float
     path_length_m: float
     num_reflections: int
+    num_walls: int
 
 
 class SimulationDocument(BaseModel):
@@ -182,19 +190,22 @@ def mixture_document(station_id: str, view: DirectionView, *, most_cells: int = 
                 "path_length_m": float(length),
                 "path_length_stdev_m": float(stdev),
                 "num_reflections": int(reflections),
+                "num_walls": int(walls),
             }
-            for share, place, cov, length, stdev, reflections in zip(
+            for share, place, cov, length, stdev, reflections, walls in zip(
                 view.probability,
                 view.position,
                 view.position_cov,
                 view.path_length,
                 view.path_length_stdev,
                 view.num_reflections,
+                view.num_walls,
                 strict=True,
             )
             if share > 0.0
         ],
         "by_reflections": view.by_reflections.tolist(),
+        "by_walls": view.by_walls.tolist(),
     }
 
 
@@ -206,6 +217,7 @@ def path_document(path: SimulatedPath) -> dict[str, Any]:
         "zenith_deg": math.degrees(path.zenith),
         "path_length_m": path.path_length,
         "num_reflections": path.num_reflections,
+        "num_walls": path.num_walls,
     }
 
 

@@ -37,9 +37,11 @@ class DirectionView:
     position_cov : ndarray of shape (n, 3, 3), m2
     path_length : ndarray of shape (n,), m
     path_length_stdev : ndarray of shape (n,), m
-    num_reflections : ndarray of int64, shape (n,)
+    num_reflections, num_walls : ndarray of int64, shape (n,)
     by_reflections : ndarray of shape (k,)
         Probability that the path has 0, 1, ... reflections, over all components.
+    by_walls : ndarray of shape (k,)
+        Probability that it passes 0, 1, ... walls.
     """
 
     in_field_of_view: bool
@@ -55,7 +57,9 @@ class DirectionView:
     path_length: NDArray[np.float64]
     path_length_stdev: NDArray[np.float64]
     num_reflections: NDArray[np.int64]
+    num_walls: NDArray[np.int64]
     by_reflections: NDArray[np.float64]
+    by_walls: NDArray[np.float64]
 
 
 def view_direction(
@@ -81,7 +85,9 @@ def view_direction(
     level = lookup.level
     begins, ends = level.cell_offsets[lookup.cells], level.cell_offsets[lookup.cells + 1]
     rows = np.concatenate([np.arange(begin, end) for begin, end in zip(begins, ends, strict=True)])
-    reflections = level.mixture.num_reflections[rows].astype(np.int64)
+    reflections, walls = (
+        column[rows].astype(np.int64) for column in (level.mixture.num_reflections, level.mixture.num_walls)
+    )
     log_evidence = float(np.logaddexp.reduce(mixture.log_evidence, initial=-np.inf))
     fraction = np.exp(mixture.log_evidence - log_evidence) if len(mixture) else np.empty(0)
     top = np.argsort(-fraction, kind="stable")[:limit]
@@ -99,7 +105,9 @@ def view_direction(
         path_length=mixture.mean[top, 3],
         path_length_stdev=np.sqrt(mixture.cov[top, 3, 3]),
         num_reflections=reflections[top],
+        num_walls=walls[top],
         by_reflections=np.bincount(reflections, weights=fraction).astype(np.float64),
+        by_walls=np.bincount(walls, weights=fraction).astype(np.float64),
     )
 
 

@@ -113,6 +113,7 @@ def _coverage(station_id: str, part: StationPart) -> dict[str, object]:
     return {
         "station_id": station_id,
         "coverage": list(part.coverage),
+        "wall_coverage": list(part.wall_coverage),
         "levels": [
             {
                 "window_deg": round(math.degrees(level.window), 9),

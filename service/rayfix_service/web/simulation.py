@@ -39,7 +39,7 @@ class SimulatedPath:
     azimuth, zenith : float, rad
         From the station towards the incoming ray, in the scene frame.
     path_length : float, m
-    num_reflections : int
+    num_reflections, num_walls : int
     dropped : int
         Number of components near the position that were left out because rounding made their covariances singular.
     """
@@ -49,6 +49,7 @@ class SimulatedPath:
     zenith: float
     path_length: float
     num_reflections: int
+    num_walls: int
     dropped: int = 0
 
 
@@ -93,6 +94,7 @@ def find_path(part: StationPart, position: NDArray[np.float64]) -> SimulatedPath
         zenith=float(np.clip(zenith + vertical, 0.0, np.pi)),
         path_length=float(length),
         num_reflections=int(mixture.num_reflections[near[best]]),
+        num_walls=int(mixture.num_walls[near[best]]),
         dropped=dropped,
     )
 

@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 from rayfix_tables.disk.files import OpenFile
 from rayfix_tables.disk.schema import (
     CELL_CHANGE,
+    FACE_THICKNESS,
     FORMAT,
     LEVEL_DATASETS,
     LOG_BALANCE,
+    NUM_WALLS,
     PATH_DATASETS,
     READ_VERSIONS,
     SCENE_DATASETS,
@@ -48,8 +50,8 @@ _OF_THE_SYSTEM = frozenset(
 _STATION = re.compile(r"stations/[^/]+\Z")
 _PATHS = re.compile(r"stations/[^/]+/paths\Z")
 _LEVEL = re.compile(r"stations/[^/]+/levels/(0|[1-9][0-9]{0,3})\Z")
-_OF_SCENE = {**SCENE_DATASETS, **TEXT_DATASETS}
-_OF_LEVELS = {**LEVEL_DATASETS, "log_balance": LOG_BALANCE, "cell_change": CELL_CHANGE}
+_OF_SCENE = {**SCENE_DATASETS, **TEXT_DATASETS, "scene/face_thickness_m": FACE_THICKNESS}
+_OF_LEVELS = {**LEVEL_DATASETS, "num_walls": NUM_WALLS, "log_balance": LOG_BALANCE, "cell_change": CELL_CHANGE}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,8 +173,8 @@ def read_layout(opened: OpenFile) -> FileLayout:
     # and another program may hold; a table never changes in place.
     with h5py.File(f"/dev/fd/{opened.descriptor}", "r", locking=False) as file:
         # Damaged texts in a heap can make HDF5 hang; files of later versions must not have any.
-        known = _whole_number(file, "format_version")
-        reader = _Reader(size=opened.size, in_heaps=known not in READ_VERSIONS or known == TEXT_IN_HEAPS)
+        later = [version for version in READ_VERSIONS if version != TEXT_IN_HEAPS]
+        reader = _Reader(size=opened.size, in_heaps=_whole_number(file, "format_version") not in later)
         root = reader.attributes_of(file.id, "")
         if root.get("format") != FORMAT:
             raise NotATableError(

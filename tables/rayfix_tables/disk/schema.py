@@ -40,9 +40,15 @@ LEVEL_DATASETS: dict[str, tuple[type[np.generic], int]] = {
     "ring_cells": (np.int64, 1),
     "cell_offsets": (np.int64, 1),
     "cell_log_mass": (np.float64, 1),
-    **{name: (FIELD_DTYPES[name], 1 + len(shape)) for name, shape in FIELD_SHAPES.items()},
+    **{name: (FIELD_DTYPES[name], 1 + len(shape)) for name, shape in FIELD_SHAPES.items() if name != "num_walls"},
 }
 """Type and number of axes of a level's datasets."""
+
+FACE_THICKNESS: tuple[type[np.generic], int] = (np.float64, 1)
+"""Type and number of axes of ``scene/face_thickness_m``, which only scenes with a known thickness have."""
+
+NUM_WALLS: tuple[type[np.generic], int] = (FIELD_DTYPES["num_walls"], 1)
+"""Type and number of axes of a level's ``num_walls``, which only levels with paths through walls have."""
 
 LOG_BALANCE: tuple[type[np.generic], int] = (np.float32, 1)
 """Type and number of axes of a level's ``log_balance``, which only balanced levels have."""

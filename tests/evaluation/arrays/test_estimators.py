@@ -167,6 +167,8 @@ def paths_of(azimuths_deg: list[float], lengths: list[float]) -> Paths:
         num_reflections=np.zeros(count, np.int64),
         gain_db=-20.0 * np.log10(lengths),
         vertices=np.zeros((count, 2, 3)),
+        crossings=np.empty((count, 0, 3)),
+        num_walls=np.zeros(count, np.int64),
     )
 
 

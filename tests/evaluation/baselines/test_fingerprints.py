@@ -93,7 +93,7 @@ def test_a_grid_without_a_free_place_says_so(room: Table) -> None:
 def test_every_rival_has_a_name_of_its_own_and_locates(room: Table, measure: Any) -> None:
     point = np.array([2.5, 1.5, 1.5])
     rivals = every_rival(room, height=1.5, map_spacing=1.0)
-    assert len({rival.name for rival in rivals}) == len(rivals) == 6
+    assert len({rival.name for rival in rivals}) == len(rivals) == 7
     report = Report(
         measurements=measure("aoa", "abcd", point) + measure("pt", "abcd", point) + measure("toa", "abcd", point)
     )

@@ -1,9 +1,11 @@
 """Least squares on straight paths: exact without noise, efficient with it."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rayfix_evaluation.baselines.line_of_sight import Kind, LineOfSight
 from rayfix_service.fusion.measurements.report import Height, Report
@@ -121,3 +123,56 @@ def test_noise_scatters_fixes_as_the_information_says(room: Table, measure: Any)
 def test_the_name_says_what_is_fitted(room: Table) -> None:
     assert rival(room, "angles").name == "line of sight, angles"
     assert rival(room, "angles", "ranges").name == "line of sight, angles and ranges"
+    robust = replace(rival(room, "angles", "ranges"), robust=True)
+    assert robust.name == "robust line of sight, angles and ranges"
+
+
+def test_the_robust_variant_leaves_a_reflected_path_aside(room: Table, measure: Any) -> None:
+    """One station of four reports the image of the transmitter in the ceiling: squares are dragged there."""
+    image = UE * [1.0, 1.0, -1.0] + [0.0, 0.0, 6.0]
+    report = Report(
+        measurements=measure("aoa", "abc")
+        + measure("pt", "abc")
+        + measure("aoa", "d", image)
+        + measure("pt", "d", image)
+    )
+    squares = rival(room, "angles", "ranges")
+    plain, robust = squares.locate(report), replace(squares, robust=True).locate(report)
+    assert plain is not None
+    assert robust is not None
+    assert np.linalg.norm(plain - UE) > 0.3
+    assert np.linalg.norm(robust - UE) < 0.01
+
+
+def test_the_robust_variant_is_exact_and_minimises_cauchys_loss(room: Table, measure: Any) -> None:
+    """Without noise the truth; with it, no point around has a smaller loss, computed here from the definition."""
+    robust = replace(rival(room, "angles", "ranges", "differences"), robust=True)
+    for kinds in (("aoa",), ("aoa", "pt"), ("aoa", "toa"), ("aoa", "tdoa")):
+        exact = robust.locate(Report(measurements=sum((measure(kind) for kind in kinds), ())))
+        assert exact is not None
+        np.testing.assert_allclose(exact, UE, rtol=0, atol=1e-3)
+    rng = np.random.default_rng(4)
+    lengths = {m.station_id: m.path_length + rng.normal(0.0, m.stdev) for m in measure("pt")}
+    noisy = tuple(
+        type(m)(station_id=m.station_id, path_length=lengths[m.station_id], stdev=m.stdev) for m in measure("pt")
+    )
+    found = robust.locate(Report(measurements=measure("aoa") + noisy))
+    assert found is not None
+
+    def loss(point: NDArray[np.float64]) -> float:
+        total = 0.0
+        for station in room.site.stations:
+            x, y, z = point - station.position
+            x0, y0, z0 = UE - station.position
+            turned = np.arctan2(y, x) - np.arctan2(y0, x0)
+            residuals = [
+                (np.mod(turned + np.pi, 2 * np.pi) - np.pi) / 0.01,
+                (np.arctan2(np.hypot(x, y), z) - np.arctan2(np.hypot(x0, y0), z0)) / 0.02,
+                (np.sqrt(x * x + y * y + z * z) - lengths[station.id]) / 0.3,
+            ]
+            total += float(np.log1p(np.square(residuals)).sum())
+        return total
+
+    around = found + rng.normal(0.0, 0.01, (200, 3))
+    assert loss(found) <= min(loss(point) for point in around)
+    assert loss(found) < loss(UE)

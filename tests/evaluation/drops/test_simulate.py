@@ -36,6 +36,8 @@ def paths_of(rows: list[tuple[float, float, float, float]]) -> Paths:
         num_reflections=np.zeros(len(table), dtype=np.int64),
         gain_db=table[:, 3],
         vertices=np.zeros((len(table), 2, 3)),
+        crossings=np.empty((len(table), 0, 3)),
+        num_walls=np.zeros(len(table), np.int64),
     )
 
 

@@ -7,7 +7,7 @@ import trimesh
 from rayfix_evaluation.paper.points import Launcher, RayPoints, draw_directions, points_on_rays
 from rayfix_evaluation.paper.selection import RelativeLength, select_by_length, select_tuples
 from rayfix_offline.scene.engine import EmbreeEngine
-from rayfix_offline.scene.materials import constant_reflectivity
+from rayfix_offline.scene.walls import opaque_walls
 from rayfix_offline.twin.planes import merge_coplanar
 from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
 from rayfix_tables.geometry.angles import angles_of
@@ -22,7 +22,7 @@ def launcher() -> Launcher:
     return Launcher(
         engine=EmbreeEngine(triangles),
         planes=merge_coplanar(triangles),
-        reflectivity=constant_reflectivity(len(triangles), loss_db=0.0),
+        walls=opaque_walls(len(triangles), loss_db=0.0),
         bounds=ROOM,
         max_reflections=1,
         max_path_length=100.0,

@@ -30,6 +30,8 @@ def moved(paths: Paths, turn: Array, shift: Array) -> Paths:
         num_reflections=paths.num_reflections,
         gain_db=paths.gain_db,
         vertices=paths.vertices @ turn.T + shift,
+        crossings=paths.crossings @ turn.T + shift,
+        num_walls=paths.num_walls,
     )
 
 

@@ -47,7 +47,7 @@ def moments_of_pieces(level: LevelRays, cell: int) -> tuple[NDArray[np.float64],
 @pytest.mark.parametrize("cell", CELLS)
 def test_points_are_drawn_from_the_measure_of_the_cell(level: LevelRays, cell: int) -> None:
     count = 20_000
-    points, num_reflections, mass = sample_points(level.grid.centres[cell], level, count, np.random.default_rng(0))
+    points, labels, mass = sample_points(level.grid.centres[cell], level, count, np.random.default_rng(0))
     assert points.shape == (count, 6)
     expected, variance, its_mass = moments_of_pieces(level, int(cell))
     assert mass == pytest.approx(its_mass, rel=1e-12)
@@ -56,14 +56,14 @@ def test_points_are_drawn_from_the_measure_of_the_cell(level: LevelRays, cell: i
     tolerance = 4.0 * found.std(axis=0) / np.sqrt(count) + 10.0 * level.ray_spacing**2
     assert np.all(np.abs(found.mean(axis=0) - expected) < tolerance)
     assert points[:, 0].var() == pytest.approx(variance, rel=0.05)
-    assert set(num_reflections.tolist()) <= {0, 1}
+    assert set(labels.num_reflections.tolist()) <= {0, 1}
 
 
 def test_points_are_where_their_ray_coordinates_say(level: LevelRays) -> None:
     """The direct ones lie at station + L direction(a)."""
     centre = level.grid.centres[CELLS[0]]
-    points, num_reflections, _ = sample_points(centre, level, 500, np.random.default_rng(1))
-    direct = points[num_reflections == 0]
+    points, labels, _ = sample_points(centre, level, 500, np.random.default_rng(1))
+    direct = points[labels.num_reflections == 0]
     heading = direction(centre[0] + direct[:, 1] / np.sin(centre[1]), centre[1] + direct[:, 2])
     np.testing.assert_allclose(direct[:, 3:], (3.6, 0.4, 2.6) + direct[:, :1] * heading, rtol=0, atol=1e-9)
     assert 100 < len(direct) < 500

@@ -19,7 +19,7 @@ def test_moments_of_all_points(seed: int) -> None:
     mean = np.einsum("gp,gpi->gi", weights, points) / mass[:, None]
     off = points - mean[:, None]
     cov = np.einsum("gp,gpi,gpj->gij", weights, off, off) / mass[:, None, None]
-    found = join_groups(sequence, piece, mass, mean, cov, mirror)
+    found = join_groups(sequence, piece, mass, mean, cov, mirror, rng.integers(0, 4, 12))
     keys = list(dict.fromkeys(zip(sequence.tolist(), piece.tolist(), strict=True)))
     assert found[0].tolist() == [key[0] for key in keys]
     for n, key in enumerate(keys):
@@ -36,7 +36,8 @@ def test_groups_that_stay_alone_are_not_touched() -> None:
     rng = np.random.default_rng(0)
     mass, mean, cov = rng.random(4), rng.normal(size=(4, 6)), rng.normal(size=(4, 6, 6))
     sequence, piece = np.array([3, 1, 1, 0]), np.array([0, 5, 2, 5])
-    found = join_groups(sequence, piece, mass, mean, cov, rng.normal(size=(4, 3, 3)))
+    found = join_groups(sequence, piece, mass, mean, cov, rng.normal(size=(4, 3, 3)), np.arange(4))
+    np.testing.assert_array_equal(found[5], np.arange(4))
     for joined, alone in zip(found, (sequence, mass, mean, cov), strict=False):
         np.testing.assert_array_equal(joined, alone)
 
@@ -45,7 +46,8 @@ def test_the_numbers_of_sequences_do_not_matter() -> None:
     """Another scene numbers them in another way; a cell that it leaves alone must not change by a bit."""
     rng = np.random.default_rng(1)
     sequence, piece = rng.integers(0, 4, 15), rng.integers(0, 3, 15)
-    rest = rng.random(15), rng.normal(size=(15, 6)), rng.normal(size=(15, 6, 6)), rng.normal(size=(15, 3, 3))
+    mass, mean, cov, mirror = (rng.random((15, *shape)) for shape in ((), (6,), (6, 6), (3, 3)))
+    rest = mass, mean, cov, mirror, rng.integers(0, 4, 15)
     found = join_groups(sequence, piece, *rest)
     numbers = np.array([70, 20, 90, 40])
     again = join_groups(numbers[sequence], piece, *rest)
@@ -56,5 +58,5 @@ def test_the_numbers_of_sequences_do_not_matter() -> None:
 
 def test_no_groups() -> None:
     empty = np.zeros(0, np.int64)
-    found = join_groups(empty, empty, np.zeros(0), np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros((0, 3, 3)))
-    assert [len(part) for part in found] == [0] * 5
+    found = join_groups(empty, empty, np.zeros(0), np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros((0, 3, 3)), empty)
+    assert [len(part) for part in found] == [0] * 6

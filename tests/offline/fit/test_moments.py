@@ -1,7 +1,7 @@
 """Moments of a cell's ray pieces against a plain NumPy twin; their blur against derivatives."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def traced(clutter: NDArray[np.float64], launch_in: Launch) -> Traced:
 def gather(traced: Traced, centre: tuple[float, float], window: float, rows: NDArray[np.int32] | None = None) -> Groups:
     """Run the kernel; groups by sequence and slice."""
     rays, pieces = traced.rays, traced.pieces
-    sequence, slices, mass, mean, cov = gather_groups(
+    sequence, slices, _, mass, mean, cov = gather_groups(
         *centre,
         window,
         RayFit.cutoff,
@@ -75,7 +75,8 @@ def naive_groups(traced: Traced, centre: tuple[float, float], window: float) -> 
     weight = density[ray] * pieces.mass
     heading = np.einsum("nij,nj->ni", traced.sequences.mirrors[pieces.sequence], rays.directions[ray])
     place = traced.sequences.images[pieces.sequence] + pieces.mean[:, None] * heading
-    joint = np.concatenate([pieces.mean[:, None], at[ray], place], axis=1)
+    measured = pieces.mean + pieces.excess
+    joint = np.concatenate([measured[:, None], at[ray], place], axis=1)
     along = np.concatenate([np.ones((len(ray), 1)), np.zeros((len(ray), 2)), heading], axis=1)
     found: Groups = {}
     for key in sorted(set(zip(pieces.sequence.tolist(), pieces.slice.tolist(), strict=True))):
@@ -100,9 +101,14 @@ CENTRES = [
 ]
 
 
+@pytest.mark.parametrize("walls", [False, True])
 @pytest.mark.parametrize("centre", CENTRES)
 @pytest.mark.parametrize("window", [0.03, 0.2])
-def test_gathered_groups(traced: Traced, centre: tuple[float, float], window: float) -> None:
+def test_gathered_groups(traced: Traced, centre: tuple[float, float], window: float, walls: bool) -> None:
+    """Walls make measured lengths longer, and move no position."""
+    if walls:
+        excess = np.random.default_rng(0).choice([0.0, 0.1, 0.4], len(traced.pieces.mass)).astype(np.float32)
+        traced = replace(traced, pieces=replace(traced.pieces, excess=excess))
     found, expected = gather(traced, centre, window), naive_groups(traced, centre, window)
     assert len(found) == len(expected) > 2
     assert found.keys() == expected.keys()
@@ -151,6 +157,8 @@ def test_the_mass_is_the_integral_of_the_window(window: float) -> None:
         mass=one,
         mean=2.0 * one,
         variance=0.01 * one,
+        excess=np.zeros(len(rays), np.float32),
+        num_walls=np.zeros(len(rays), np.int8),
     )
     centre = (0.4, 1.2)
     ((mass, mean, cov),) = gather(Traced(rays, pieces, no_reflections()), centre, window).values()

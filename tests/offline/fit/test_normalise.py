@@ -40,6 +40,7 @@ def level_of(mean: Array, stdev: Array, log_mass: float) -> Level:
         jacobian=np.zeros((count, 3, 3)),
         x_cov=pack(stdev[:, None, None] ** 2 * np.eye(3)),
         num_reflections=np.zeros(count),
+        num_walls=np.zeros(count),
     )
     return Level(window=WINDOW, grid=grid, cell_offsets=offsets, cell_log_mass=log_masses, mixture=mixture.as_stored())
 

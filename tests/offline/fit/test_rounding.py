@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rayfix_offline.fit.tubes import joint_to_tubes
+from rayfix_offline.fit.tubes import Labels, joint_to_tubes
 from rayfix_tables.mixture import FIELD_SHAPES
 
 FLOOR = 0.002  # m
@@ -24,10 +24,9 @@ def test_the_last_bits_of_moments_change_no_tube() -> None:
     noise = rng.normal(0.0, 1e-17, cov[:, 3:, 3:].shape)
     other = cov.copy()
     other[:, 3:, 3:] += noise + noise.transpose(0, 2, 1)
-    reflections = np.zeros(count, np.int8)
+    labels = Labels(np.zeros(count, np.int8), np.zeros(count, np.int8))
     exact, noisy = (
-        joint_to_tubes(np.zeros(count), mean, each, reflections, position_floor=FLOOR).as_stored()
-        for each in (cov, other)
+        joint_to_tubes(np.zeros(count), mean, each, labels, position_floor=FLOOR).as_stored() for each in (cov, other)
     )
     for name in FIELD_SHAPES:
         assert getattr(exact, name).tobytes() == getattr(noisy, name).tobytes(), name

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rayfix_offline.fit.em import fit_em, sample_points
 from rayfix_offline.fit.settings import ExpectationMaximisation, RayFit, TubeFit
-from rayfix_offline.fit.tubes import Fitted, fit_tubes, fitted_cells
+from rayfix_offline.fit.tubes import Fitted, Labels, fit_tubes, fitted_cells
 from rayfix_offline.rays.trace import LevelRays
 from rayfix_offline.site import parse_site
 from rayfix_tables.geometry.angles import direction, tangent
@@ -290,8 +290,8 @@ def joint_moments(variance: Array) -> tuple[Array, Array]:
 def as_cells(counts: list[int], weight: Array, variance: Array) -> Fitted:
     """Turn components of cells of mass 1 into mixtures."""
     mean, cov = joint_moments(variance)
-    log_mass, reflections = np.zeros(len(counts)), np.zeros(len(weight), np.int8)
-    return fitted_cells(np.array(counts), log_mass, np.log(weight), mean, cov, reflections, position_floor=0.002)
+    log_mass, labels = np.zeros(len(counts)), Labels(np.zeros(len(weight), np.int8), np.zeros(len(weight), np.int8))
+    return fitted_cells(np.array(counts), log_mass, np.log(weight), mean, cov, labels, position_floor=0.002)
 
 
 @pytest.mark.parametrize("variance", [0.0, -1.0, np.nan, np.inf])
@@ -322,9 +322,8 @@ def test_covariances_are_definite_as_the_table_holds_them(seed: int) -> None:
     cov = root @ root.transpose(0, 2, 1)
     mean = np.abs(rng.normal(size=(20, 6))) + 1.0
     log_weight = np.full(20, -np.log(20.0))
-    found = fitted_cells(
-        np.array([20]), np.zeros(1), log_weight, mean, cov, np.zeros(20, np.int8), position_floor=0.002
-    )
+    labels = Labels(np.zeros(20, np.int8), np.zeros(20, np.int8))
+    found = fitted_cells(np.array([20]), np.zeros(1), log_weight, mean, cov, labels, position_floor=0.002)
     assert found.counts[0] + found.dropped[0] == 20
     assert len(found.mixture) > 15
     for packed in (found.mixture.u_cov, found.mixture.x_cov):

@@ -118,18 +118,13 @@ def test_cells_agree_with_a_plain_twin(trace: Callable[..., Traced], kind: str) 
 
 def crosses(segments: Segments, directions: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
     """Whether rays come to a box: the slab method on each of their straight stretches."""
-    hit = np.zeros(len(directions), bool)
-    sequences = segments.sequences
-    for depth in range(segments.sequence.shape[1]):
-        run = segments.sequence[:, depth] >= 0
-        sequence = segments.sequence[run, depth]
-        heading = np.einsum("nij,nj->ni", sequences.mirrors[sequence], directions[run])
-        with np.errstate(divide="ignore"):
-            low, high = ((np.array(corner) - sequences.images[sequence]) / heading for corner in box)
-        enter = np.maximum(np.minimum(low, high).max(axis=1), segments.start[run, depth])
-        leave = np.minimum(np.maximum(low, high).min(axis=1), segments.end[run, depth])
-        hit[run] |= enter <= leave + 1e-9
-    return hit
+    sequences, sequence = segments.sequences, segments.sequence
+    heading = np.einsum("nij,nj->ni", sequences.mirrors[sequence], directions[segments.ray])
+    with np.errstate(divide="ignore"):
+        low, high = ((np.array(corner) - sequences.images[sequence]) / heading for corner in box)
+    enter = np.maximum(np.minimum(low, high).max(axis=1), segments.start)
+    leave = np.minimum(np.maximum(low, high).min(axis=1), segments.end)
+    return np.bincount(segments.ray, weights=enter <= leave + 1e-9, minlength=len(directions)) > 0
 
 
 def test_exactly_the_rays_that_meet_a_moved_object_change(trace: Callable[..., Traced]) -> None:

@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from rayfix_offline.rays.launch import launch
 from rayfix_offline.rays.rays import sample_rays
-from rayfix_offline.rays.segments import Segments
-from rayfix_offline.scene.materials import constant_reflectivity
+from rayfix_offline.scene.walls import opaque_walls
 from rayfix_offline.twin.planes import merge_coplanar
+from tests.support.oracles.rays import Rows
 from tests.support.scenes.shapes import quad
 
-Launch = Callable[..., Segments]
+Launch = Callable[..., Rows]
 Vectors = Callable[[int, int], NDArray[np.float64]]
 SIZE = np.array([4.0, 5.0, 3.0])
 STATION = np.array([3.6, 0.4, 2.6])
 EXACT = 1e-9  # m
 
 
-def points_at(segments: Segments, directions: NDArray[np.float64], length: NDArray[np.float64]) -> NDArray[np.float64]:
+def points_at(segments: Rows, directions: NDArray[np.float64], length: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points at unfolded lengths, one per segment; NaN where there is no segment. Shape (n_rays, depth, 3), m."""
     sequences = segments.sequences
     heading = np.einsum("rdij,rj->rdi", sequences.mirrors[segments.sequence], directions)
@@ -30,7 +30,7 @@ def points_at(segments: Segments, directions: NDArray[np.float64], length: NDArr
     return np.where(segments.sequence[..., None] >= 0, points, np.nan)
 
 
-def assert_contiguous(segments: Segments, directions: NDArray[np.float64], station: NDArray[np.float64]) -> None:
+def assert_contiguous(segments: Rows, directions: NDArray[np.float64], station: NDArray[np.float64]) -> None:
     """Check that pieces follow each other without gaps, from the station on, and only while there is one before."""
     alive = segments.sequence >= 0
     assert alive[:, 0].all()
@@ -44,7 +44,7 @@ def assert_contiguous(segments: Segments, directions: NDArray[np.float64], stati
     assert np.abs(gaps).max(initial=0.0) < EXACT
 
 
-def assert_sequences_fit(segments: Segments) -> None:
+def assert_sequences_fit(segments: Rows) -> None:
     """Check that every sequence is its parent's with one more reflection."""
     sequences = segments.sequences
     assert (sequences.parents[0], sequences.planes[0], sequences.num_reflections[0]) == (-1, -1, 0)
@@ -64,7 +64,7 @@ def assert_sequences_fit(segments: Segments) -> None:
     np.testing.assert_array_equal(sequences.parents[after[alive[:, 1:]]], before[alive[:, 1:]])
 
 
-def test_one_wall(launch_in: Launch) -> None:
+def test_one_wall(launch_rows: Launch) -> None:
     r"""A wall in the plane x = 0; the second ray misses it and ends where the scene does.
 
     ::
@@ -78,7 +78,7 @@ def test_one_wall(launch_in: Launch) -> None:
     wall = quad((0, -10, -10), (0, 10, -10), (0, 10, 10), (0, -10, 10))
     frame = quad((0, 20, 0), (9, 20, 0), (9, 20.1, 0), (0, 20.1, 0))
     directions = np.array([(-0.6, 0.8, 0.0), (0.8, -0.6, 0.0)])
-    segments = launch_in(np.concatenate([wall, frame]), (1, 0, 1), directions, max_reflections=2)
+    segments = launch_rows(np.concatenate([wall, frame]), (1, 0, 1), directions, max_reflections=2)
     sequences = segments.sequences
     assert segments.sequence.tolist() == [[0, 1, -1], [0, -1, -1]]
     np.testing.assert_allclose(sequences.images, [(1, 0, 1), (-1, 0, 1)], rtol=0, atol=1e-15)
@@ -92,7 +92,7 @@ def test_one_wall(launch_in: Launch) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_empty_room(launch_in: Launch, room: NDArray[np.float64], seed: int) -> None:
+def test_empty_room(launch_rows: Launch, room: NDArray[np.float64], seed: int) -> None:
     """Unfolded, a ray is a straight line through a lattice of rooms; it is mirrored wherever it crosses a wall.
 
     ::
@@ -107,7 +107,7 @@ def test_empty_room(launch_in: Launch, room: NDArray[np.float64], seed: int) -> 
     station = SIZE * rng.uniform(0.02, 0.98, 3)
     directions = rng.normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
-    segments = launch_in(room, station, directions, max_reflections=4)
+    segments = launch_rows(room, station, directions, max_reflections=4)
     walls = np.arange(-6, 7)[:, None] * SIZE
     with np.errstate(divide="ignore"):
         crossings = (walls - station) / directions[:, None, :]
@@ -135,10 +135,10 @@ def test_empty_room(launch_in: Launch, room: NDArray[np.float64], seed: int) -> 
     assert_sequences_fit(segments)
 
 
-def test_hits_lie_on_their_planes(launch_in: Launch, clutter: NDArray[np.float64], unit_vectors: Vectors) -> None:
+def test_hits_lie_on_their_planes(launch_rows: Launch, clutter: NDArray[np.float64], unit_vectors: Vectors) -> None:
     """In the clutter, every mirror point lies in the plane of a triangle and within the triangle's bounds."""
     directions = unit_vectors(5000, 5)
-    segments = launch_in(clutter, STATION, directions, max_reflections=3)
+    segments = launch_rows(clutter, STATION, directions, max_reflections=3)
     assert_contiguous(segments, directions, STATION)
     assert_sequences_fit(segments)
     hits = points_at(segments, directions, segments.end).reshape(-1, 3)
@@ -157,11 +157,11 @@ def test_hits_lie_on_their_planes(launch_in: Launch, clutter: NDArray[np.float64
 
 
 def test_nothing_lies_between_the_ends_of_a_piece(
-    launch_in: Launch, clutter: NDArray[np.float64], unit_vectors: Vectors
+    launch_rows: Launch, clutter: NDArray[np.float64], unit_vectors: Vectors
 ) -> None:
     """No point along a ray is in a box or outside the room."""
     directions = unit_vectors(2000, 6)
-    segments = launch_in(clutter, STATION, directions, max_reflections=3)
+    segments = launch_rows(clutter, STATION, directions, max_reflections=3)
     for share in np.linspace(0.0, 1.0, 23):
         points = points_at(segments, directions, segments.start + share * (segments.end - segments.start))
         assert np.all((points > -EXACT) & (points < SIZE + EXACT))
@@ -170,10 +170,10 @@ def test_nothing_lies_between_the_ends_of_a_piece(
             assert depth.max() < 1e-6 * 4  # m
 
 
-def test_the_longest_path(launch_in: Launch, room: NDArray[np.float64], unit_vectors: Vectors) -> None:
+def test_the_longest_path(launch_rows: Launch, room: NDArray[np.float64], unit_vectors: Vectors) -> None:
     directions = unit_vectors(2000, 7)
     free, cut = (
-        launch_in(room, STATION, directions, max_reflections=5, max_path_length=length) for length in (1000.0, 7.0)
+        launch_rows(room, STATION, directions, max_reflections=5, max_path_length=length) for length in (1000.0, 7.0)
     )
     np.testing.assert_array_equal(cut.sequence >= 0, (free.sequence >= 0) & (free.start < 7.0))
     alive = cut.sequence >= 0
@@ -182,15 +182,15 @@ def test_the_longest_path(launch_in: Launch, room: NDArray[np.float64], unit_vec
     assert cut.end.max() == 7.0
 
 
-def test_no_reflections(launch_in: Launch, room: NDArray[np.float64], unit_vectors: Vectors) -> None:
+def test_no_reflections(launch_rows: Launch, room: NDArray[np.float64], unit_vectors: Vectors) -> None:
     directions = unit_vectors(100, 8)
-    none, one = (launch_in(room, STATION, directions, max_reflections=n) for n in (0, 1))
+    none, one = (launch_rows(room, STATION, directions, max_reflections=n) for n in (0, 1))
     assert none.sequence.shape == (100, 1)
     np.testing.assert_array_equal(none.end[:, 0], one.end[:, 0])
     assert len(none.sequences.images) == 1
 
 
-def test_a_missing_wall_loses_its_share_of_the_rays(launch_in: Launch) -> None:
+def test_a_missing_wall_loses_its_share_of_the_rays(launch_rows: Launch) -> None:
     """A cube without its wall at x = 2, seen from its middle: one sixth of the sphere.
 
     Rays stand for solid angles that differ by a thousandth from ring to ring, and 500 of 126,000 lie on the rim.
@@ -198,17 +198,17 @@ def test_a_missing_wall_loses_its_share_of_the_rays(launch_in: Launch) -> None:
     cube = np.concatenate([_side(axis, value) for axis in range(3) for value in (0.0, 2.0)])
     open_cube = cube[np.any(cube[:, :, 0] != 2.0, axis=1)]
     rays = sample_rays(0.01, np.random.default_rng(0))
-    segments = launch_in(open_cube, (1, 1, 1), rays.directions, max_reflections=0)
+    segments = launch_rows(open_cube, (1, 1, 1), rays.directions, max_reflections=0)
     assert segments.lost_ray_share == pytest.approx(1 / 6, abs=5e-4)
     # They end where the scene ends.
     lost = points_at(segments, rays.directions, segments.end)[:, 0, 0] > 2.0 - EXACT
     assert lost.mean() == pytest.approx(segments.lost_ray_share, abs=1e-9)  # one ray is 8e-6
     # After one reflection, those are lost that hit the wall first or second when it is there.
-    closed = launch_in(cube, (1, 1, 1), rays.directions, max_reflections=1)
+    closed = launch_rows(cube, (1, 1, 1), rays.directions, max_reflections=1)
     assert closed.lost_ray_share <= 1e-4  # few rays may pass between two walls
     gone = np.any(points_at(closed, rays.directions, closed.end)[:, :, 0] > 2.0 - EXACT, axis=1)
     assert gone.mean() > 0.19
-    segments = launch_in(open_cube, (1, 1, 1), rays.directions, max_reflections=1)
+    segments = launch_rows(open_cube, (1, 1, 1), rays.directions, max_reflections=1)
     assert segments.lost_ray_share == pytest.approx(gone.mean(), abs=2e-5)
 
 
@@ -218,7 +218,7 @@ def _side(axis: int, value: float) -> NDArray[np.float64]:
     return quad(*np.insert(square, axis, value, axis=1))
 
 
-def test_a_corner_sends_rays_back(launch_in: Launch) -> None:
+def test_a_corner_sends_rays_back(launch_rows: Launch) -> None:
     """Two walls at a right angle: after both, a ray runs against its first direction.
 
     ::
@@ -234,7 +234,7 @@ def test_a_corner_sends_rays_back(launch_in: Launch) -> None:
         ]
     )
     direction = np.array([(-1.0, -1.0, 0.0)]) / np.sqrt(2.0)
-    segments = launch_in(walls, (4, 2, 1), direction, max_reflections=4)
+    segments = launch_rows(walls, (4, 2, 1), direction, max_reflections=4)
     assert (segments.sequence[0] >= 0).tolist() == [True, True, True, False, False]
     np.testing.assert_allclose(segments.end[0, :2], np.sqrt(2.0) * np.array([2.0, 4.0]), rtol=0, atol=1e-14)
     last = segments.sequence[0, 2]
@@ -258,28 +258,30 @@ def test_a_hit_behind_the_ray_is_a_loss() -> None:
     """The wall at x = 0 is ahead of the first ray, behind the second and parallel to the third."""
     wall = quad((0, -9, -9), (0, 9, -9), (0, 9, 9), (0, -9, 9))
     directions = np.array([(-1.0, 0, 0), (1.0, 0, 0), (0, 1.0, 0)])
-    segments = launch(
-        np.array([1.0, 0.0, 0.0]),
-        directions,
-        engine=Misled(),
-        planes=merge_coplanar(wall),
-        reflectivity=constant_reflectivity(len(wall), loss_db=6.0),
-        bounds=np.array([(0, -9, -9), (5, 9, 9)]),
-        max_reflections=1,
-        max_path_length=100.0,
+    rows = Rows.of(
+        launch(
+            np.array([1.0, 0.0, 0.0]),
+            directions,
+            engine=Misled(),
+            planes=merge_coplanar(wall),
+            walls=opaque_walls(len(wall), loss_db=6.0),
+            bounds=np.array([(0, -9, -9), (5, 9, 9)]),
+            max_reflections=1,
+            max_path_length=100.0,
+        )
     )
     # Mirrored, the first ray is told of the same wall again, which is now behind it.
-    assert (segments.sequence >= 0).tolist() == [[True, True], [True, False], [True, False]]
-    np.testing.assert_allclose(segments.end, [(1, 6), (4, 0), (9, 0)], rtol=0, atol=1e-14)
-    assert segments.lost_ray_share == 1.0
+    assert (rows.sequence >= 0).tolist() == [[True, True], [True, False], [True, False]]
+    np.testing.assert_allclose(rows.end, [(1, 6), (4, 0), (9, 0)], rtol=0, atol=1e-14)
+    assert rows.lost_ray_share == 1.0
 
 
-def test_a_thin_sheet_reflects_on_both_sides(launch_in: Launch) -> None:
+def test_a_thin_sheet_reflects_on_both_sides(launch_rows: Launch) -> None:
     sheet = quad((0, -9, -9), (0, 9, -9), (0, 9, 9), (0, -9, 9))
     frame = np.concatenate([quad((x, 9, 9), (x, 9, 8), (x, 8, 8), (x, 8, 9)) for x in (-3, 3)])
     for side in (1.0, -1.0):
         direction = np.array([(-side, 0.0, 0.0)])
-        segments = launch_in(np.concatenate([sheet, frame]), (side, 0.1, 0.2), direction, max_reflections=1)
+        segments = launch_rows(np.concatenate([sheet, frame]), (side, 0.1, 0.2), direction, max_reflections=1)
         np.testing.assert_allclose(segments.end[0], [1.0, 4.0], rtol=0, atol=1e-14)
         stop = points_at(segments, direction, segments.end)[0, 1]
         np.testing.assert_allclose(stop, (3 * side, 0.1, 0.2), rtol=0, atol=1e-14)
@@ -289,13 +291,13 @@ def test_a_thin_sheet_reflects_on_both_sides(launch_in: Launch) -> None:
 def test_map_coordinates_change_nothing(
     shift: tuple[float, float, float],
     clutter: NDArray[np.float64],
-    launch_in: Callable[..., Segments],
+    launch_rows: Callable[..., Rows],
     unit_vectors: Vectors,
 ) -> None:
     """A scene on map coordinates has the same mirrors and lengths, and its images where the map has them."""
     directions, station = unit_vectors(2000, 5), np.array((3.6, 0.4, 2.6))
-    here = launch_in(clutter, station, directions)
-    there = launch_in(clutter + shift, station + shift, directions)
+    here = launch_rows(clutter, station, directions)
+    there = launch_rows(clutter + shift, station + shift, directions)
     assert there.lost_ray_share == here.lost_ray_share == 0.0
     same = (here.sequence >= 0).sum(axis=1) == (there.sequence >= 0).sum(axis=1)
     same &= np.abs(here.end - there.end).max(axis=1) < 1e-5

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rayfix_evaluation.truth.forward import ForwardSolver
-from rayfix_offline.rays.segments import Segments
 from rayfix_tables.geometry.angles import direction
+from tests.support.oracles.rays import Rows
 from tests.support.scenes.shapes import box, cut_in_three
 
-Launch = Callable[..., Segments]
+Launch = Callable[..., Rows]
 Vectors = Callable[[int, int], NDArray[np.float64]]
 STATION = np.array([3.6, 0.4, 2.6])
 LOW, HIGH = np.array([0.05, 0.05, 0.05]), np.array([3.95, 4.95, 2.95])
@@ -22,7 +22,7 @@ EXACT = 1e-9  # m
 
 
 def points_at(
-    segments: Segments,
+    segments: Rows,
     directions: NDArray[np.float64],
     ray: NDArray[np.int64],
     depth: NDArray[np.int64],
@@ -49,7 +49,7 @@ def solver(clutter: NDArray[np.float64]) -> ForwardSolver:
     )
 
 
-def test_every_path_is_launched(clutter: NDArray[np.float64], launch_in: Launch, solver: ForwardSolver) -> None:
+def test_every_path_is_launched(clutter: NDArray[np.float64], launch_rows: Launch, solver: ForwardSolver) -> None:
     """Aimed along a path's angles, a ray meets its mirror points and goes through its end, at the path's length."""
     station = solver.station(STATION)
     targets = np.random.default_rng(0).uniform(LOW, HIGH, (60, 3))
@@ -59,7 +59,7 @@ def test_every_path_is_launched(clutter: NDArray[np.float64], launch_in: Launch,
         if not len(paths):
             continue
         directions = direction(paths.azimuth, paths.zenith)
-        segments = launch_in(clutter, STATION, directions, max_reflections=3)
+        segments = launch_rows(clutter, STATION, directions, max_reflections=3)
         ray, depth = np.arange(len(paths)), paths.num_reflections
         assert np.all(segments.sequence[ray, depth] >= 0)
         assert np.all(segments.start[ray, depth] < paths.path_length)
@@ -78,11 +78,11 @@ def test_every_path_is_launched(clutter: NDArray[np.float64], launch_in: Launch,
 
 
 def test_every_launched_piece_is_a_path(
-    clutter: NDArray[np.float64], launch_in: Launch, solver: ForwardSolver, unit_vectors: Vectors
+    clutter: NDArray[np.float64], launch_rows: Launch, solver: ForwardSolver, unit_vectors: Vectors
 ) -> None:
     """At a random place of each piece, the image method finds a path of that length, angle and number of bounces."""
     directions = unit_vectors(150, 1)
-    segments = launch_in(clutter, STATION, directions, max_reflections=3)
+    segments = launch_rows(clutter, STATION, directions, max_reflections=3)
     station = solver.station(STATION)
     ray, depth = (index.ravel() for index in np.indices(segments.sequence.shape))
     start, end = segments.start[ray, depth], segments.end[ray, depth]
@@ -102,12 +102,12 @@ def test_every_launched_piece_is_a_path(
 # What must not matter
 
 
-def lengths(segments: Segments) -> NDArray[np.float64]:
+def lengths(segments: Rows) -> NDArray[np.float64]:
     """Give the ends of the pieces [m]; 0 where there is none."""
     return np.where(segments.sequence >= 0, segments.end, 0.0)
 
 
-def assert_same_rays(actual: Segments, expected: Segments, *, atol: float = EXACT) -> None:
+def assert_same_rays(actual: Rows, expected: Rows, *, atol: float = EXACT) -> None:
     """Check lengths and images; the numbers of sequences and planes may differ."""
     np.testing.assert_array_equal(actual.sequence >= 0, expected.sequence >= 0)
     np.testing.assert_allclose(lengths(actual), lengths(expected), rtol=0, atol=atol)
@@ -125,39 +125,39 @@ def rays(unit_vectors: Vectors) -> NDArray[np.float64]:
 
 
 @pytest.fixture(scope="module")
-def reference(clutter: NDArray[np.float64], launch_in: Launch, rays: NDArray[np.float64]) -> Segments:
+def reference(clutter: NDArray[np.float64], launch_rows: Launch, rays: NDArray[np.float64]) -> Rows:
     """Launch the rays in the room as it is."""
-    return launch_in(clutter, STATION, rays)
+    return launch_rows(clutter, STATION, rays)
 
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_order_of_triangles_and_vertices(
-    clutter: NDArray[np.float64], launch_in: Launch, rays: NDArray[np.float64], reference: Segments, seed: int
+    clutter: NDArray[np.float64], launch_rows: Launch, rays: NDArray[np.float64], reference: Rows, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     shuffled = clutter[rng.permutation(len(clutter))]
     corners = np.array([rng.permutation(3) for _ in shuffled])
     shuffled = shuffled[np.arange(len(shuffled))[:, None], corners]
-    assert_same_rays(launch_in(shuffled, STATION, rays), reference)
+    assert_same_rays(launch_rows(shuffled, STATION, rays), reference)
 
 
 def test_splitting_triangles(
-    clutter: NDArray[np.float64], launch_in: Launch, rays: NDArray[np.float64], reference: Segments
+    clutter: NDArray[np.float64], launch_rows: Launch, rays: NDArray[np.float64], reference: Rows
 ) -> None:
-    assert_same_rays(launch_in(cut_in_three(clutter), STATION, rays), reference)
+    assert_same_rays(launch_rows(cut_in_three(clutter), STATION, rays), reference)
 
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_rigid_motion(
-    clutter: NDArray[np.float64], launch_in: Launch, rays: NDArray[np.float64], reference: Segments, seed: int
+    clutter: NDArray[np.float64], launch_rows: Launch, rays: NDArray[np.float64], reference: Rows, seed: int
 ) -> None:
     """Moved by up to 50 m, single precision rounds edges to 4 micrometres: a ray in a thousand may take another way."""
     rng = np.random.default_rng(seed)
     rotation, shift = Rotation.random(rng=rng), rng.uniform(-50, 50, 3)
     moved = rotation.apply(clutter.reshape(-1, 3)).reshape(-1, 3, 3) + shift
-    segments = launch_in(moved, rotation.apply(STATION) + shift, rotation.apply(rays))
+    segments = launch_rows(moved, rotation.apply(STATION) + shift, rotation.apply(rays))
     same = np.abs(lengths(segments) - lengths(reference)).max(axis=1) < EXACT
     assert np.count_nonzero(~same) <= 3
     images = segments.sequences.images[segments.sequence[same]]
@@ -167,9 +167,9 @@ def test_rigid_motion(
 
 def test_a_far_object(
     clutter: NDArray[np.float64],
-    launch_in: Launch,
+    launch_rows: Launch,
     rays: NDArray[np.float64],
-    reference: Segments,
+    reference: Rows,
 ) -> None:
     """Behind the walls, 40 m away and askew, so that it shares no plane with the room.
 
@@ -177,7 +177,7 @@ def test_a_far_object(
     """
     crate = Rotation.from_euler("xyz", (10, 20, 30), degrees=True).apply(box((0, 0, 0), (1, 1, 1)).reshape(-1, 3))
     scene = np.concatenate([clutter, crate.reshape(-1, 3, 3) + 40.0])
-    segments = launch_in(scene, STATION, rays)
+    segments = launch_rows(scene, STATION, rays)
     same = np.abs(lengths(segments) - lengths(reference)).max(axis=1) < EXACT
     assert np.count_nonzero(~same) <= 2
     images = segments.sequences.images[segments.sequence[same]]
@@ -185,10 +185,10 @@ def test_a_far_object(
 
 
 def test_rays_do_not_know_of_each_other(
-    clutter: NDArray[np.float64], launch_in: Launch, rays: NDArray[np.float64], reference: Segments
+    clutter: NDArray[np.float64], launch_rows: Launch, rays: NDArray[np.float64], reference: Rows
 ) -> None:
     order = np.random.default_rng(4).permutation(len(rays))
-    segments = launch_in(clutter, STATION, rays[order])
+    segments = launch_rows(clutter, STATION, rays[order])
     np.testing.assert_array_equal(segments.end, reference.end[order])
     np.testing.assert_array_equal(
         segments.sequences.images[segments.sequence], reference.sequences.images[reference.sequence[order]]

@@ -1,15 +1,17 @@
 """The voxel map of the path-selection prior against closed forms."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from rayfix_evaluation.truth.forward import ForwardSolver
-from rayfix_offline.rays.pathprior import PathPrior, fill_path_prior, reflection_factors
+from rayfix_offline.rays.pathprior import PathPrior, fill_path_prior, wall_factors
 from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments
+from rayfix_offline.scene.walls import opaque_walls
 from rayfix_tables.freespace import FreeSpace
 from tests.support.scenes.shapes import box
 
@@ -42,12 +44,12 @@ def distances(prior: PathPrior, place: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(np.linalg.norm(centres(prior) - place, axis=-1))
 
 
-def test_reflection_factors(rays: RaySet, room: NDArray[np.float64], launch_in: Launch) -> None:
+def test_wall_factors(rays: RaySet, room: NDArray[np.float64], launch_in: Launch) -> None:
     """6 dB are a factor of 0.251 in power; to the power of beta = 2, 0.0631."""
     segments = launch_in(room, STATION, rays.directions[:100], max_reflections=2)
-    expected = np.broadcast_to([1.0, 10**-1.2, 10**-2.4], (100, 3))
-    np.testing.assert_allclose(reflection_factors(segments, 2.0), expected, rtol=1e-14)
-    np.testing.assert_array_equal(reflection_factors(segments, 0.0), 1.0)
+    expected = np.tile([1.0, 10**-1.2, 10**-2.4], 100)
+    np.testing.assert_allclose(wall_factors(segments, 2.0), expected, rtol=1e-14)
+    np.testing.assert_array_equal(wall_factors(segments, 0.0), 1.0)
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
@@ -172,3 +174,26 @@ def test_rays_that_leave_the_map_do_no_harm(rays: RaySet, direct: Segments) -> N
     # The outer voxels are half outside the map, and count as half free.
     np.testing.assert_allclose(prior.total[:3, :4, :2], 1.0, rtol=0, atol=0.12)
     assert prior.total[3, :4, :2].mean() == pytest.approx(2.0, abs=0.1)
+
+
+def test_a_wall_weakens_what_is_behind_it(rays: RaySet, launch_in: Launch) -> None:
+    """A sheet at x = 2 m that takes 3 dB, and a pillar behind it in which nothing can be."""
+    sheet = np.array([[(2, 0, 0), (2, 5, 0), (2, 5, 3)], [(2, 0, 0), (2, 5, 3), (2, 0, 3)]], float)
+    scene = np.concatenate([box((0, 0, 0), (4, 5, 3)), sheet])
+    walls = opaque_walls(len(scene), loss_db=6.0)
+    lets = np.arange(len(scene)) >= 12
+    walls = replace(walls, transmission_loss_db=np.where(lets, 3.0, np.inf))
+    free = np.ones((40, 50, 30), bool)
+    free[30:34, 20:24, :] = False
+    space = FreeSpace(origin=np.zeros(3), voxel_size=0.1, free=free)
+    segments = launch_in(scene, STATION, rays.directions, max_reflections=0, walls=walls)
+    prior = fill_path_prior(rays, segments, space, exponent=1.0, refinement=2)
+    ratio = prior.total * distances(prior, STATION) ** 2
+    assert ratio[2:10].mean() == pytest.approx(1.0, abs=0.02)
+    behind = ratio[10:]
+    pillar = np.zeros(prior.total.shape, bool)
+    pillar[15:17, 10:12] = True
+    np.testing.assert_array_equal(prior.total[pillar], np.inf)
+    assert behind[~pillar[10:]].mean() == pytest.approx(10.0**-0.3, rel=0.02)
+    assert prior.coverage == (1.0,)
+    assert prior.wall_coverage == pytest.approx((0.5 / (1.0 - 0.16 * 3 / 60), 1.0), rel=0.01)

@@ -15,7 +15,7 @@ from rayfix_offline.rays.rays import RaySet, sample_rays
 from rayfix_offline.rays.segments import Segments
 from rayfix_offline.rays.settings import RaySettings
 from rayfix_tables.freespace import FreeSpace
-from tests.support.oracles.rays import no_reflections
+from tests.support.oracles.rays import Rows, no_reflections
 
 Launch = Callable[..., Segments]
 Kind = Literal["power", "uniform", "paper"]
@@ -55,18 +55,19 @@ def ray_sums(pieces: Pieces, values: NDArray[np.float64]) -> NDArray[np.float64]
 def test_uniform_masses_add_up_to_the_integral(rays: RaySet, segments: Segments) -> None:
     """The hats are a partition of unity, so a ray's masses add up to the integral of s^2, which is end^3 / 3."""
     pieces = cut(rays, segments, "uniform")
-    np.testing.assert_allclose(ray_sums(pieces, pieces.mass), segments.end.max(axis=1) ** 3 / 3.0, rtol=1e-12)
+    np.testing.assert_allclose(ray_sums(pieces, pieces.mass), Rows.of(segments).end.max(axis=1) ** 3 / 3.0, rtol=1e-12)
 
 
 def test_paper_masses_add_up_to_the_length(rays: RaySet, segments: Segments) -> None:
     pieces = cut(rays, segments, "paper")
-    np.testing.assert_allclose(ray_sums(pieces, pieces.mass), segments.end.max(axis=1), rtol=1e-13)
+    np.testing.assert_allclose(ray_sums(pieces, pieces.mass), Rows.of(segments).end.max(axis=1), rtol=1e-13)
 
 
 def test_power_masses_add_up_to_the_share_of_a_constant_total(rays: RaySet, segments: Segments) -> None:
     """With beta = 1, s^2 gain is 10^(-0.6 k) after k reflections: the integrand is constant where the total is."""
     pieces = cut(rays, segments, "power", total=1e6)
-    span = np.where(segments.sequence >= 0, segments.end - segments.start, 0.0)
+    rows = Rows.of(segments)
+    span = rows.end - rows.start
     expected = (span * 10.0 ** (-0.6 * np.arange(3))).sum(axis=1) / 1e6
     np.testing.assert_allclose(ray_sums(pieces, pieces.mass), expected, rtol=1e-12)
 
@@ -87,12 +88,12 @@ def test_the_voxel_of_the_point_decides(rays: RaySet, segments: Segments, axis: 
     prior = PathPrior(origin=np.zeros(3), voxel_size=0.5, total=total, free_volume=np.ones(1), coverage=(1.0,))
     pieces = cut_pieces(rays, segments, prior, exponent=0.0, kind="power", slice_ratio=RATIO)
     sums = ray_sums(pieces, pieces.mass)
-    sequences = segments.sequences
+    rows, sequences = Rows.of(segments), segments.sequences
     for ray in range(0, len(rays), 20):
         expected = 0.0
         for depth in range(3):
-            seq = segments.sequence[ray, depth]
-            start, end = segments.start[ray, depth], segments.end[ray, depth]
+            seq = rows.sequence[ray, depth]
+            start, end = rows.start[ray, depth], rows.end[ray, depth]
             length = start + (np.arange(20_000) + 0.5) / 20_000 * (end - start)
             place = sequences.images[seq, axis] + length * (sequences.mirrors[seq] @ rays.directions[ray])[axis]
             expected += np.sum(length**2 * np.where(place < middle, 1.0, 0.25)) * (end - start) / 20_000
@@ -104,7 +105,7 @@ def test_the_voxel_of_the_point_decides(rays: RaySet, segments: Segments, axis: 
 def test_moments_of_each_piece(rays: RaySet, segments: Segments, kind: Kind) -> None:
     """Against a fine quadrature with hats that are interpolated between nodes at 0.25 m x 1.35^n."""
     pieces = cut_pieces(rays, segments, prior_of(1.0), exponent=1.0, kind=kind, slice_ratio=RATIO)
-    nodes = RaySettings.first_node * RATIO ** np.arange(25)
+    rows, nodes = Rows.of(segments), RaySettings.first_node * RATIO ** np.arange(25)
     for ray in range(0, len(rays), 15):
         mine = slice(pieces.offsets[ray], pieces.offsets[ray + 1])
         found = {
@@ -120,7 +121,7 @@ def test_moments_of_each_piece(rays: RaySet, segments: Segments, kind: Kind) -> 
         }
         assert len(found) == mine.stop - mine.start
         for depth in range(3):
-            seq, start, end = (field[ray, depth] for field in (segments.sequence, segments.start, segments.end))
+            seq, start, end = (field[ray, depth] for field in (rows.sequence, rows.start, rows.end))
             length = start + (np.arange(20_000) + 0.5) / 20_000 * (end - start)
             weight = (length**2 if kind == "uniform" else np.ones_like(length)) * (end - start) / 20_000
             for n in range(25):
@@ -151,9 +152,10 @@ def test_pieces_lie_within_their_slice_and_their_segment(rays: RaySet, segments:
     assert np.all((pieces.variance <= (high - low) ** 2 / 4.0)[used])
     ray = np.repeat(np.arange(len(rays)), np.diff(pieces.offsets))
     depth = segments.sequences.num_reflections[pieces.sequence]
-    np.testing.assert_array_equal(segments.sequence[ray, depth], pieces.sequence)
-    assert np.all((pieces.mean >= segments.start[ray, depth] - 1e-9)[used])
-    assert np.all((pieces.mean <= segments.end[ray, depth] + 1e-9)[used])
+    rows = Rows.of(segments)
+    np.testing.assert_array_equal(rows.sequence[ray, depth], pieces.sequence)
+    assert np.all((pieces.mean >= rows.start[ray, depth] - 1e-9)[used])
+    assert np.all((pieces.mean <= rows.end[ray, depth] + 1e-9)[used])
 
 
 @settings(max_examples=20, deadline=None)
@@ -162,12 +164,17 @@ def test_any_segment(start: float, span: float, ratio: float) -> None:
     """Segments that begin or end at, below or far beyond the first node, and tiny ones."""
     end = start + span
     segments = Segments(
-        sequence=np.zeros((1, 1), np.int32),
-        start=np.array([[start]]),
-        end=np.array([[end]]),
-        log_gain=np.zeros((1, 1)),
+        offsets=np.array([0, 1]),
+        sequence=np.zeros(1, np.int32),
+        start=np.array([start]),
+        end=np.array([end]),
+        log_gain=np.zeros(1),
+        excess=np.zeros(1),
+        num_walls=np.zeros(1, np.int8),
         sequences=no_reflections(),
+        max_reflections=0,
         lost_ray_share=0.0,
+        cut_power_share=0.0,
     )
     rays = sample_rays(0.5, np.random.default_rng(0))
     pieces = cut_pieces(rays, segments, prior_of(1.0), exponent=1.0, kind="paper", slice_ratio=ratio)

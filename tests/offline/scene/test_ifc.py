@@ -282,3 +282,25 @@ def test_the_plain_name_of_the_newest_schema(save: Callable[[Model], Path]) -> N
     assert times == 1
     path.write_text(text)
     assert load_scene(path).sha256 == plain.sha256
+
+
+def test_layers_state_the_thickness(save: Callable[[Model], Path]) -> None:
+    """In the file's unit, whether the layers belong to the wall itself or to its type's usage."""
+    import ifcopenshell.api.material
+
+    model = Model("IFC4", "MILLI")
+    plain, layered = (model.box("IfcWall", name, (0, 0, 0), (3, 0.125, 3)) for name in ("plain", "layered"))
+    model.material(plain, "itu_brick")
+    layers = ifcopenshell.api.material.add_material_set(model.file, name="lining", set_type="IfcMaterialLayerSet")
+    for name, thickness in (("itu_plasterboard", 25.0), ("itu_wood", 75.0), ("itu_plasterboard", 25.0)):
+        material = ifcopenshell.api.material.add_material(model.file, name=name)
+        layer = ifcopenshell.api.material.add_layer(model.file, layer_set=layers, material=material)
+        ifcopenshell.api.material.edit_layer(model.file, layer=layer, attributes={"LayerThickness": thickness})
+    ifcopenshell.api.material.assign_material(
+        model.file, products=[layered], type="IfcMaterialLayerSetUsage", material=layers
+    )
+    scene = load_scene(save(model))
+    assert scene.face_thickness is not None
+    for name, thickness in (("plain", np.nan), ("layered", 0.125)):
+        found = {round(float(value), 9) for value in scene.face_thickness[named(scene, name)]}
+        assert found == {thickness} or (np.isnan(thickness) and np.isnan(list(found)).all())

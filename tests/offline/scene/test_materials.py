@@ -1,6 +1,7 @@
 """Permittivities and reflection coefficients against hand-made numbers, and what the launch makes of them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,28 +15,27 @@ from trimesh.visual.material import PBRMaterial
 
 from rayfix_evaluation.drops.accuracy import solver_of
 from rayfix_evaluation.truth.forward import ForwardSolver
-from rayfix_evaluation.truth.fresnel import reflection_gain_db
+from rayfix_evaluation.truth.fresnel import half_space
+from rayfix_evaluation.truth.walls import Walls as SolverWalls
 from rayfix_offline.build import build_table
-from rayfix_offline.rays.segments import Segments
-from rayfix_offline.rays.trace import reflectivity_of
+from rayfix_offline.rays.trace import scene_walls
 from rayfix_offline.scene.materials import (
     ITU_MATERIALS,
     ReflectionSettings,
-    Reflectivity,
     complex_permittivity,
-    constant_reflectivity,
     face_permittivity,
     fresnel_coefficients,
     fresnel_power,
     itu_name,
-    itu_reflectivity,
 )
+from rayfix_offline.scene.walls import Walls, opaque_walls
 from rayfix_offline.site import read_site
 from rayfix_offline.twin.twin import prepare_twin, refuse_errors
 from rayfix_tables.table import Table
+from tests.support.oracles.rays import Rows
 
 WriteSite = Callable[..., Path]
-Launch = Callable[..., Segments]
+Launch = Callable[..., Rows]
 cosines = st.floats(0.0, 1.0)
 permittivities = st.builds(lambda re, im: complex(re, -im), st.floats(1.0, 100.0), st.floats(0.0, 1e8))
 
@@ -45,6 +45,13 @@ def known(name: str, carrier_ghz: float) -> complex:
     found = complex_permittivity(name, carrier_ghz)
     assert found is not None
     return found
+
+
+def half_spaces(permittivity: NDArray[np.complex128], loss_db: float) -> Walls:
+    """Triangles of these permittivities that let nothing through; the loss is that of NaN."""
+    walls = opaque_walls(len(permittivity), loss_db=loss_db)
+    loss = np.where(np.isnan(permittivity), walls.reflection_loss_db, np.nan)
+    return replace(walls, permittivity=permittivity, reflection_loss_db=loss)
 
 
 @pytest.mark.parametrize(
@@ -161,8 +168,8 @@ def test_energy(cosine: float, permittivity: complex) -> None:
 @given(cosine=st.floats(1e-3, 1.0), permittivity=permittivities)
 def test_the_forward_solver_has_the_same_physics(cosine: float, permittivity: complex) -> None:
     """Two formulas that share no code; where next to nothing is reflected, what is left is rounding."""
-    theirs = 10.0 ** (reflection_gain_db(np.array([cosine]), np.array([permittivity])) / 10.0)
-    assert theirs[0] == pytest.approx(float(fresnel_power(cosine, permittivity)), rel=1e-6, abs=1e-9)
+    theirs = (np.abs(half_space(np.array([cosine]), np.array([permittivity]))) ** 2).mean()
+    assert theirs == pytest.approx(float(fresnel_power(cosine, permittivity)), rel=1e-6, abs=1e-9)
 
 
 def test_arrays_broadcast() -> None:
@@ -176,9 +183,9 @@ def test_arrays_broadcast() -> None:
 
 def test_triangles_without_a_known_material_have_the_constant_loss() -> None:
     materials = ("itu_concrete", "steel", "itu_floorboard")
-    reflectivity = itu_reflectivity(np.array([0, 1, 2, -1], np.int16), materials, carrier_ghz=3.5, loss_db=7.0)
+    walls = half_spaces(face_permittivity(np.array([0, 1, 2, -1], np.int16), materials, 3.5), 7.0)
     faces = np.array([3, 2, 1, 0, 0], np.int32)
-    power = reflectivity.power(faces, np.array([0.1, 0.5, 1.0, 1.0, 0.5]))
+    power = 10.0 ** walls.reflected(faces, np.array([0.1, 0.5, 1.0, 1.0, 0.5]))
     concrete = known("concrete", 3.5)
     expected = [10**-0.7] * 3 + [float(fresnel_power(1.0, concrete)), float(fresnel_power(0.5, concrete))]
     np.testing.assert_allclose(power, expected, rtol=1e-13)
@@ -186,13 +193,13 @@ def test_triangles_without_a_known_material_have_the_constant_loss() -> None:
 
 def test_no_materials_at_all() -> None:
     np.testing.assert_array_equal(face_permittivity(np.full(3, -1, np.int16), (), 3.5), [np.nan] * 3)
-    log_gain = constant_reflectivity(3, loss_db=6.0).log_gain(np.array([0, 2], np.int32), np.ones(2))
+    log_gain = opaque_walls(3, loss_db=6.0).reflected(np.array([0, 2], np.int32), np.ones(2))
     np.testing.assert_allclose(log_gain, -0.1 * 6.0, rtol=1e-12)
 
 
 def test_vacuum_leaves_a_little() -> None:
-    reflectivity = itu_reflectivity(np.zeros(1, np.int16), ("itu_vacuum",), carrier_ghz=3.5, loss_db=6.0)
-    assert reflectivity.log_gain(np.zeros(1, np.int32), np.array([0.7])) == np.log10(ReflectionSettings.min_power)
+    walls = half_spaces(face_permittivity(np.zeros(1, np.int16), ("itu_vacuum",), 3.5), 6.0)
+    assert walls.reflected(np.zeros(1, np.int32), np.array([0.7])) == np.log10(ReflectionSettings.min_power)
 
 
 # Launched rays
@@ -204,27 +211,27 @@ def corridor() -> NDArray[np.float64]:
     return np.concatenate([floor, floor + np.array([0, 0, 2])])
 
 
-def test_losses_add_up_along_a_ray(launch_in: Launch) -> None:
+def test_losses_add_up_along_a_ray(launch_rows: Launch) -> None:
     """A ray at 60 deg from the vertical between a concrete floor and a ceiling of 7 dB: down, up, down."""
     concrete = known("concrete", 3.5)
-    reflectivity = Reflectivity(permittivity=np.array([concrete, concrete, np.nan, np.nan]), loss_db=7.0)
+    walls = half_spaces(np.array([concrete, concrete, np.nan, np.nan]), 7.0)
     heading = np.array([[np.sqrt(0.75), 0.0, -0.5]])
-    segments = launch_in(corridor(), (0, 0.1, 1), heading, max_reflections=3, reflectivity=reflectivity)
+    segments = launch_rows(corridor(), (0, 0.1, 1), heading, max_reflections=3, walls=walls)
     floor = np.log10(fresnel_power(0.5, concrete))
     np.testing.assert_allclose(segments.log_gain, [[0.0, floor, floor - 0.7, 2 * floor - 0.7]], rtol=1e-12)
 
 
-def test_paths_of_launcher_and_solver_are_alike(launch_in: Launch, clutter: NDArray[np.float64]) -> None:
+def test_paths_of_launcher_and_solver_are_alike(launch_rows: Launch, clutter: NDArray[np.float64]) -> None:
     """Each launched ray meets the image method's paths with the same gain: walls, cabinet and table differ."""
     face_materials = np.repeat(np.arange(3), 12).astype(np.int16)
     materials = ("itu_plasterboard", "itu_metal", "oak")
-    reflectivity = itu_reflectivity(face_materials, materials, carrier_ghz=3.5, loss_db=4.0)
+    walls = half_spaces(face_permittivity(face_materials, materials, 3.5), 4.0)
     solver = ForwardSolver.from_mesh(
         clutter.reshape(-1, 3),
         np.arange(108).reshape(-1, 3),
         max_reflections=2,
         reflection_loss_db=4.0,
-        face_permittivity=reflectivity.permittivity,
+        walls=SolverWalls.opaque(walls.permittivity, carrier_ghz=3.5),
     )
     station = np.array([3.6, 0.4, 2.6])
     paths = solver.paths(station, np.array([2.1, 2.4, 1.3]))
@@ -236,7 +243,7 @@ def test_paths_of_launcher_and_solver_are_alike(launch_in: Launch, clutter: NDAr
         ],
         axis=1,
     )
-    segments = launch_in(clutter, station, heading, max_reflections=2, reflectivity=reflectivity)
+    segments = launch_rows(clutter, station, heading, max_reflections=2, walls=walls)
     log_gain = segments.log_gain[np.arange(len(paths)), paths.num_reflections]
     np.testing.assert_allclose(10.0 * log_gain - 20.0 * np.log10(paths.path_length), paths.gain_db, rtol=0, atol=1e-6)
     assert len(paths) > 10
@@ -244,8 +251,9 @@ def test_paths_of_launcher_and_solver_are_alike(launch_in: Launch, clutter: NDAr
 
 
 def test_the_solver_wants_one_permittivity_for_each_face() -> None:
-    with pytest.raises(ValueError, match="one value for each of the 4 faces"):
-        ForwardSolver.from_mesh(corridor().reshape(-1, 3), np.arange(12).reshape(-1, 3), face_permittivity=[2.0])
+    walls = SolverWalls.opaque(np.array([2.0 + 0j]), carrier_ghz=3.5)
+    with pytest.raises(ValueError, match="the walls have 1 faces and the mesh 4"):
+        ForwardSolver.from_mesh(corridor().reshape(-1, 3), np.arange(12).reshape(-1, 3), walls=walls)
 
 
 # Sites
@@ -267,11 +275,13 @@ def test_the_site_decides(
     site = read_site(write_site(tmp_path, scene=scene, propagation=propagation))
     twin = prepare_twin(site, tmp_path)
     assert twin.findings == ()
-    reflectivity = reflectivity_of(site, twin)
-    assert reflectivity.loss_db == 5.0
+    walls = scene_walls(site, twin)
+    assert not walls.passable.any()
     for n, material in enumerate(twin.scene.materials):
-        mine = reflectivity.permittivity[twin.scene.face_materials == n]
-        np.testing.assert_array_equal(mine, known(material, 28.0) if reflection == "itu" else np.nan)
+        mine = twin.scene.face_materials == n
+        by_name = reflection == "itu"
+        np.testing.assert_array_equal(walls.permittivity[mine], known(material, 28.0) if by_name else np.nan)
+        np.testing.assert_array_equal(walls.reflection_loss_db[mine], np.nan if by_name else 5.0)
 
 
 def test_what_the_constant_loss_stands_in_for_is_told(
@@ -304,9 +314,11 @@ def test_the_solver_of_a_table_has_its_materials(
         build_table(path, tmp_path / f"{reflection}.h5")
         tables[reflection] = Table.open(tmp_path / f"{reflection}.h5")
         solvers[reflection] = solver_of(tables[reflection])
-    assert solvers["constant"].triangle_permittivity is None
-    permittivity = solvers["itu"].triangle_permittivity
-    assert permittivity is not None
+    assert solvers["constant"].walls is None
+    walls = solvers["itu"].walls
+    assert walls is not None
+    assert not walls.lets_through.any()
+    permittivity = walls.permittivity
     materials = {known("brick", 3.5): 12, known("metal", 3.5): 12}
     assert {value: int(np.sum(permittivity == value)) for value in materials} == materials
     assert np.isnan(permittivity).sum() == 12

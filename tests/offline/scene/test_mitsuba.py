@@ -223,3 +223,16 @@ def test_a_damaged_mesh(folder: Path) -> None:
 def test_points_are_no_shape(folder: Path) -> None:
     trimesh.PointCloud(np.random.default_rng(0).normal(size=(9, 3))).export(folder / "meshes" / "box.ply")
     assert "shape 'box': meshes/box.ply holds no triangles" in refused_scene(folder, shape())
+
+
+def test_the_thickness_of_a_material(folder: Path) -> None:
+    """Sionna RT states it in metres, whatever the unit of the scene."""
+    material = '<string name="type" value="glass"/><float name="thickness" value="0.012"/>'
+    bsdf = f'<bsdf type="itu-radio-material" id="pane">{material}</bsdf>'
+    scene = load(
+        folder, bsdf + shape('<ref id="pane"/>', name="a") + shape('<bsdf type="diffuse" id="itu_wood"/>', name="b")
+    )
+    assert scene.face_thickness is not None
+    np.testing.assert_array_equal(scene.face_thickness, np.repeat([0.012, np.nan], 12))
+    with pytest.raises(SceneError, match=r"material 'pane' has the thickness 'thin'; give metres, more than 0"):
+        load(folder, bsdf.replace("0.012", "thin") + shape('<ref id="pane"/>'))

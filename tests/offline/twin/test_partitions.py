@@ -78,6 +78,7 @@ def test_a_thin_wall_between_rooms(tmp_path: Path, thickness: float, shift: Sequ
     assert "divide the free space into 2 rooms: box0, box1" in finding.problem
     assert "at 3.5 GHz" in finding.problem
     assert "leave thin partitions and doors out of the mesh" in finding.remedy
+    assert "give their materials a thickness_m in [materials.NAME]" in finding.remedy
 
 
 @pytest.mark.parametrize("material", ["itu_plasterboard", "itu_wood", "itu_glass"])

@@ -65,6 +65,7 @@ def random_mixture(rng: np.random.Generator, count: int, window: float = 0.05) -
         jacobian=rng.standard_normal((count, 3, 3)) * [1.0, 8.0, 8.0],
         x_cov=pack(random_cov(rng, count, [0.05, 0.05, 0.05])),
         num_reflections=np.zeros(count, np.int8),
+        num_walls=np.zeros(count, np.int8),
     )
 
 
@@ -101,7 +102,7 @@ def test_condition_on_angle_equals_the_joint_gaussian(dtype: type[np.floating[An
     names = ("log_weight", "u_mean", "u_cov", "x_mean", "jacobian", "x_cov")
     mixture = random_mixture(rng, 10)
     stored = {name: getattr(mixture, name).astype(dtype) for name in names}
-    mixture = TubeMixture(**stored, num_reflections=mixture.num_reflections)
+    mixture = TubeMixture(**stored, num_reflections=mixture.num_reflections, num_walls=mixture.num_walls)
     rest_mean = rng.normal(0.0, 0.03, (3, 2))
     rest_cov = random_cov(rng, 3, [0.02, 0.03])[:, [0, 0, 1], [0, 1, 1]]
     log_factor = rng.normal(size=3)

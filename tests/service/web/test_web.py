@@ -101,6 +101,8 @@ def test_the_mixture_of_a_direction_is_what_the_fusion_uses(web: RunningApp, tab
     assert probability.sum() == pytest.approx(1.0, abs=1e-6)
     assert np.all(np.diff(probability) <= 0.0)
     assert sum(document["by_reflections"]) == pytest.approx(1.0)
+    assert document["by_walls"] == pytest.approx([1.0])  # nothing lets signals through here
+    assert {c["num_walls"] for c in document["components"]} == {0}
     assert document["num_components"] == sum(c["num_components"] for c in document["cells"])
     means = np.array([[c["position"][axis] for axis in "xyz"] for c in document["components"]])
     report = {"measurements": [{"type": "aoa", "azimuth_stdev_deg": 1.0, "zenith_stdev_deg": 1.0, **angle}]}
@@ -150,6 +152,7 @@ def test_the_mass_by_reflections_is_that_of_the_cells(table: Table):
 def test_coverage_and_refusals(web: RunningApp, table: Table):
     document = web.get("/v1/stations/bs3/coverage").json()
     assert document["coverage"] == list(table.parts["bs3"].coverage)
+    assert document["wall_coverage"] == []
     assert [level["window_deg"] for level in document["levels"]] == [2.5, 10.0]
     unknown = web.get("/v1/stations/nowhere/coverage")
     assert unknown.status_code == 404
@@ -253,7 +256,7 @@ def test_places_without_signal_are_refused(web: RunningApp, table: Table):
 
 def test_a_service_may_refuse_to_simulate(hall_table_path: Path):
     with RunningApp(hall_table_path, simulation=False) as web:
-        assert web.get("/v1/viewer").json() == {"simulation": False, "max_reflections": 2}
+        assert web.get("/v1/viewer").json() == {"simulation": False, "max_reflections": 2, "open_materials": []}
         response = web.post("/v1/simulations", {"position": [1, 2, 1]})
     assert response.status_code == 403
     assert "--allow-simulation" in response.json()["detail"]

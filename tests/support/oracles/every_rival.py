@@ -32,5 +32,6 @@ def every_rival(
         LineOfSight(site=table.site, bounds=bounds, kinds=("angles",)),
         LineOfSight(site=table.site, bounds=bounds, kinds=("ranges",)),
         LineOfSight(site=table.site, bounds=bounds, kinds=("differences",)),
+        LineOfSight(site=table.site, bounds=bounds, kinds=("angles", "ranges", "differences"), robust=True),
         Fingerprinting.of_table(table, spacing=map_spacing),
     )

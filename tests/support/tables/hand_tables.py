@@ -55,6 +55,7 @@ class Tube:
     jacobian: Array
     x_cov: Array
     num_reflections: int = 0
+    num_walls: int = 0
 
 
 def line_of_sight(
@@ -104,6 +105,7 @@ def station_part(station: Station, tubes: list[Tube]) -> StationPart:
             jacobian=np.array([tube.jacobian for tube in tubes]),
             x_cov=pack(np.array([tube.x_cov for tube in tubes])),
             num_reflections=np.array([tube.num_reflections for tube in tubes], np.int8),
+            num_walls=np.array([tube.num_walls for tube in tubes], np.int8),
         )
     level = Level(window=WINDOW, grid=GRID, cell_offsets=offsets, cell_log_mass=masses, mixture=mixture)
     return StationPart(station=station, levels=(level,), lost_ray_share=0.0, coverage=(1.0,))

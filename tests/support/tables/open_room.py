@@ -47,6 +47,8 @@ def direct_paths(position: tuple[float, float, float], space: FreeSpace) -> Path
         offsets=np.arange(count + 1),
         sequence=np.zeros(count, np.int32),
         weight=np.ones(count, np.float32),
+        excess=np.zeros(0, np.float32),
+        num_walls=np.zeros(0, np.int8),
         images=np.array([position]),
         mirrors=np.eye(3)[None],
         num_reflections=np.zeros(1, np.int8),

@@ -29,14 +29,19 @@ class Content:
         return write_table(path, site=self.site, scene=self.scene, parts=self.parts, software_version=software_version)
 
 
-def random_mixture(rng: np.random.Generator, count: int) -> TubeMixture:
+def random_mixture(rng: np.random.Generator, count: int, *, walls: bool = False) -> TubeMixture:
     """Numbers of no meaning in the types of a table."""
-    fields = {name: rng.normal(size=(count, *shape)).astype(np.float32) for name, shape in FIELD_SHAPES.items()}
+    fields = {
+        name: rng.normal(size=(count, *shape)).astype(np.float32)
+        for name, shape in FIELD_SHAPES.items()
+        if name != "num_walls"
+    }
     fields["num_reflections"] = rng.integers(0, 4, count).astype(np.int8)
+    fields["num_walls"] = (np.arange(count) % 3 if walls else np.zeros(count)).astype(np.int8)
     return TubeMixture(**fields)
 
 
-def random_paths(rng: np.random.Generator, free_space: FreeSpace) -> PathMap:
+def random_paths(rng: np.random.Generator, free_space: FreeSpace, *, walls: bool = False) -> PathMap:
     """Paths of no meaning to voxels of twice the size of the free space's."""
     shape = tuple((-(-np.array(free_space.free.shape) // 2)).tolist())
     counts, num_sequences = rng.integers(0, 4, int(np.prod(shape))), 5
@@ -47,6 +52,8 @@ def random_paths(rng: np.random.Generator, free_space: FreeSpace) -> PathMap:
         offsets=np.concatenate([[0], np.cumsum(counts)]),
         sequence=rng.integers(0, num_sequences, int(counts.sum())).astype(np.int32),
         weight=rng.random(int(counts.sum())).astype(np.float32),
+        excess=rng.random(int(counts.sum()) * walls).astype(np.float32),
+        num_walls=rng.integers(0, 4, int(counts.sum()) * walls).astype(np.int8),
         images=rng.normal(size=(num_sequences, 3)),
         mirrors=rng.normal(size=(num_sequences, 3, 3)),
         num_reflections=rng.integers(0, 4, num_sequences).astype(np.int8),
@@ -54,9 +61,18 @@ def random_paths(rng: np.random.Generator, free_space: FreeSpace) -> PathMap:
 
 
 def random_content(
-    seed: int, *, num_stations: int = 2, num_levels: int = 2, num_faces: int = 5, max_components: int = 3
+    seed: int,
+    *,
+    num_stations: int = 2,
+    num_levels: int = 2,
+    num_faces: int = 5,
+    max_components: int = 3,
+    walls: bool = False,
 ) -> Content:
-    """Fill a table with random numbers; cells hold none to ``max_components`` components."""
+    """Fill a table with random numbers; cells hold none to ``max_components`` components, and paths pass walls or not.
+
+    Without walls, the numbers are those of the stored tables of former formats.
+    """
     rng = np.random.default_rng(seed)
     stations, parts = [], []
     for n in range(num_stations):
@@ -85,7 +101,7 @@ def random_content(
                     grid=grid,
                     cell_offsets=np.concatenate([[0], np.cumsum(counts)]),
                     cell_log_mass=np.where(counts > 0, rng.normal(size=len(counts)), -np.inf),
-                    mixture=random_mixture(rng, int(counts.sum())),
+                    mixture=random_mixture(rng, int(counts.sum()), walls=walls),
                     log_balance=rng.normal(size=int(counts.sum()) * (not levels)).astype(np.float32),  # the first only
                 )
             )
@@ -95,6 +111,8 @@ def random_content(
                 levels=tuple(levels),
                 lost_ray_share=rng.random(),
                 coverage=tuple(rng.random(3).tolist()),
+                wall_coverage=(0.25, 0.5) if walls else (),
+                cut_power_share=0.125 if walls else 0.0,
             )
         )
     site = SiteInfo(
@@ -111,9 +129,10 @@ def random_content(
         materials=("itu_concrete", "itu_metal"),
         free_space=FreeSpace(origin=rng.normal(size=3), voxel_size=0.1, free=rng.random((3, 4, 2)) < 0.5),
         sha256=f"{seed:064x}",
+        face_thickness=np.where(np.arange(num_faces) % 2, 0.125, np.nan) if walls else None,
     )
     return Content(
         site=site,
         scene=scene,
-        parts=tuple(replace(part, paths=random_paths(rng, scene.free_space)) for part in parts),
+        parts=tuple(replace(part, paths=random_paths(rng, scene.free_space, walls=walls)) for part in parts),
     )

@@ -66,6 +66,7 @@ def test_a_mixture_is_stored_with_definite_covariances() -> None:
         jacobian=np.zeros((count, 3, 3)),
         x_cov=pack(cov),
         num_reflections=np.zeros(count),
+        num_walls=np.zeros(count),
     ).as_stored()
     assert mixture.u_cov.dtype == mixture.x_cov.dtype == np.float32
     assert is_definite(unpack(mixture.u_cov.astype(np.float64))).all()

@@ -49,8 +49,8 @@ def read_ifc(path: Path) -> Contents:
     -------
     Contents
         An object's name is its product's, with its GlobalId. An object has one material; a product of several materials
-        becomes several objects. The material is named ``itu_concrete`` and so on if style, material or the material's
-        category identify one of ITU-R P.2040.
+        becomes several objects, each with the thickness of its layers. The material is named ``itu_concrete`` and so on
+        if style, material or the material's category identify one of ITU-R P.2040.
 
     Raises
     ------
@@ -100,7 +100,9 @@ def _products(file: "ifcopenshell.file") -> Iterator[tuple[str, Placed]]:
     """Yield GlobalIds and objects."""
     import ifcopenshell.geom
     from ifcopenshell.util.element import get_materials
+    from ifcopenshell.util.unit import calculate_unit_scale
 
+    metres = float(calculate_unit_scale(file))
     settings = ifcopenshell.geom.settings()
     settings.set("use-world-coords", True)
     settings.set("apply-default-materials", False)
@@ -115,7 +117,8 @@ def _products(file: "ifcopenshell.file") -> Iterator[tuple[str, Placed]]:
         for style in np.unique(styles):
             own = faces[styles == style]
             named = file.by_id(geometry.materials[style].instance_id()) if style >= 0 else None
-            material, face_materials = one_material(_material(getattr(named, "Name", None), materials), len(own))
+            style_name = getattr(named, "Name", None)
+            material, face_materials = one_material(_material(style_name, materials), len(own))
             used, corners = np.unique(own, return_inverse=True)
             yield (
                 shape.guid,
@@ -125,8 +128,21 @@ def _products(file: "ifcopenshell.file") -> Iterator[tuple[str, Placed]]:
                     faces=corners.reshape(-1, 3),
                     materials=material,
                     face_materials=face_materials,
+                    thickness=_thickness(style_name, product) * metres,
                 ),
             )
+
+
+def _thickness(style: str | None, product: Any) -> float:
+    """Thickness of the layers of a surface's style, or else of all layers, in the file's unit; NaN without layers."""
+    from ifcopenshell.util.element import get_material
+
+    layer_set = get_material(product, should_skip_usage=True)
+    if layer_set is None or not layer_set.is_a("IfcMaterialLayerSet"):
+        return np.nan
+    layers = layer_set.MaterialLayers
+    own = [layer for layer in layers if getattr(layer.Material, "Name", None) == style] or layers
+    return float(sum(layer.LayerThickness for layer in own)) or np.nan
 
 
 def _name(product: Any) -> str:

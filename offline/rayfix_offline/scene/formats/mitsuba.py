@@ -1,8 +1,9 @@
 """Mitsuba XML scenes, as Sionna RT and Blender's Mitsuba exporter write them.
 
 Supports the parts of the format that buildings need: shapes of type ``ply`` with ``to_world`` transforms, and the names
-of their materials. Sionna RT 1 writes ``<bsdf type="itu-radio-material">`` with a ``type``; earlier versions and
-Blender write any bsdf with an id like ``mat-itu_concrete``. Cameras, lights and integrators are ignored.
+of their materials. Sionna RT 1 writes ``<bsdf type="itu-radio-material">`` with a ``type`` and a ``thickness`` in
+metres; earlier versions and Blender write any bsdf with an id like ``mat-itu_concrete``. Cameras, lights and
+integrators are ignored.
 """
 
 import re
@@ -32,8 +33,8 @@ def read_mitsuba(path: Path) -> Contents:
     Returns
     -------
     Contents
-        An object has the material name of its shape; the different spellings of ITU-R materials become ``itu_concrete``
-        and so on.
+        An object has the material name of its shape, and the thickness of its material; the different spellings of
+        ITU-R materials become ``itu_concrete`` and so on.
 
     Raises
     ------
@@ -54,7 +55,7 @@ def read_mitsuba(path: Path) -> Contents:
                 element.set(key, _substitute(value, defaults))
     if root.find("include") is not None:
         raise SceneError(f"{path} includes another file, which is not supported; export the scene as one file")
-    materials = {element.get("id", ""): _material_name(element) for element in root.iter("bsdf")}
+    materials = {element.get("id", ""): _material(element, path) for element in root.iter("bsdf")}
     placed: list[Placed] = []
     remarks: list[Remark] = []
     num_triangles = 0
@@ -65,11 +66,18 @@ def read_mitsuba(path: Path) -> Contents:
         if kind != "ply":
             raise SceneError(f"{where} is of type '{kind}', which is not supported; export it as ply")
         transform = _to_world(shape, where)
-        material = _shape_material(shape, materials, where)
+        material, thickness = _shape_material(shape, materials, where, path)
         mesh, remarked = _mesh(path, shape, where)
         materials_of, face_materials = one_material(material, len(mesh.faces))
         placed.append(
-            replace(mesh, name=name, materials=materials_of, face_materials=face_materials, transform=transform)
+            replace(
+                mesh,
+                name=name,
+                materials=materials_of,
+                face_materials=face_materials,
+                transform=transform,
+                thickness=thickness,
+            )
         )
         remarks += [replace(each, problem=f"shape '{name}': {each.problem}") for each in remarked]
         num_triangles += len(mesh.faces)
@@ -102,6 +110,25 @@ def _substitute(value: str, defaults: dict[str, str]) -> str:
     return re.sub(r"\$(\w+)", lambda match: defaults.get(match[1], match[0]), value)
 
 
+def _material(bsdf: ElementTree.Element, path: Path) -> tuple[str | None, float]:
+    """Name of a bsdf's material, None if it has none, and its thickness in m, NaN if it has none."""
+    for element in bsdf.iter("float"):
+        if element.get("name") == "thickness":
+            where = f"{path}, material '{bsdf.get('id', '')}'"
+            return _material_name(bsdf), _thickness(element.get("value", ""), where)
+    return _material_name(bsdf), np.nan
+
+
+def _thickness(text: str, where: str) -> float:
+    try:
+        thickness = float(text)
+    except ValueError:
+        thickness = np.nan
+    if not 0.0 < thickness < _LARGEST:
+        raise SceneError(f"{where} has the thickness '{text[:60]}'; give metres, more than 0")
+    return thickness
+
+
 def _material_name(bsdf: ElementTree.Element) -> str | None:
     """Name of a bsdf's material, None if it has none."""
     for element in bsdf.iter("bsdf"):
@@ -117,10 +144,12 @@ def _material_name(bsdf: ElementTree.Element) -> str | None:
     return next((name.removeprefix("mat-") for name in names if name), None)
 
 
-def _shape_material(shape: ElementTree.Element, materials: dict[str, str | None], where: str) -> str | None:
+def _shape_material(
+    shape: ElementTree.Element, materials: dict[str, tuple[str | None, float]], where: str, path: Path
+) -> tuple[str | None, float]:
     own = shape.find("bsdf")
     if own is not None:
-        return _material_name(own)
+        return _material(own, path)
     for reference in shape.findall("ref"):
         if reference.get("name", "bsdf") != "bsdf":
             continue
@@ -130,7 +159,7 @@ def _shape_material(shape: ElementTree.Element, materials: dict[str, str | None]
                 f"{where} refers to the material '{target}', which the file does not define; add its <bsdf>"
             )
         return materials[target]
-    return None
+    return None, np.nan
 
 
 def _mesh(path: Path, shape: ElementTree.Element, where: str) -> tuple[Placed, tuple[Remark, ...]]:

@@ -150,11 +150,13 @@ def _condition_cells(components: Any, looked_up: Any) -> Any:
 
 
 def is_direct(lookup: Lookup) -> NDArray[np.bool_]:
-    """Find which components of the cells of a lookup, cell after cell, are of paths without a reflection.
+    """Find which components of the cells of a lookup, cell after cell, are of paths that meet no wall.
 
-    A component of several paths counts as the one that carries most of it.
+    A straight path through a wall is not direct. A component of several paths counts as the one that carries most of
+    it.
     """
     offsets = lookup.level.cell_offsets
     begins, counts = offsets[lookup.cells], offsets[lookup.cells + 1] - offsets[lookup.cells]
     rows = np.repeat(begins - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
-    return np.asarray(lookup.level.mixture.num_reflections[rows] == 0)
+    mixture = lookup.level.mixture
+    return np.asarray((mixture.num_reflections[rows] == 0) & (mixture.num_walls[rows] == 0))

@@ -98,11 +98,16 @@ class BlockPaths(NamedTuple):
     sequence : ndarray of int32, shape (n_paths,)
     weight : ndarray of float32, shape (n_paths,)
         Mean over the block's free part.
+    excess : ndarray of float32, shape (n_paths,) or (0,), m
+        What the walls passed add to the length; empty where none is.
+    num_walls : ndarray of int8, shape (n_paths,) or (0,)
     """
 
     offsets: NDArray[np.int64]
     sequence: NDArray[np.int32]
     weight: NDArray[np.float32]
+    excess: NDArray[np.float32]
+    num_walls: NDArray[np.int8]
 
 
 class StationPaths:
@@ -117,7 +122,7 @@ class StationPaths:
 
     def __init__(self, paths: PathMap, tree: BlockTree) -> None:
         self.images, self.mirrors, self.num_reflections = paths.images, paths.mirrors, paths.num_reflections
-        self.levels = [BlockPaths(paths.offsets, paths.sequence, paths.weight)]
+        self.levels = [BlockPaths(paths.offsets, paths.sequence, paths.weight, paths.excess, paths.num_walls)]
         for finer, coarser in zip(tree.levels, tree.levels[1:], strict=False):
             self.levels.append(
                 BlockPaths(*_joined(*self.levels[-1], np.array(finer.shape), finer.volume, np.array(coarser.shape)))
@@ -125,11 +130,21 @@ class StationPaths:
 
 
 @numba.njit(cache=True, nogil=True)
-def _joined(offsets: Any, sequence: Any, weight: Any, shape: Any, volume: Any, coarser: Any) -> Any:
-    """Paths to blocks of twice the size, their weights averaged over the free volume."""
+def _joined(
+    offsets: Any,
+    sequence: Any,
+    weight: Any,
+    excess: Any,
+    num_walls: Any,
+    shape: Any,
+    volume: Any,
+    coarser: Any,
+) -> Any:
+    """Paths to blocks of twice the size, their weights averaged over the free volume, the rest over the weights."""
     num_blocks = coarser[0] * coarser[1] * coarser[2]
+    passes = len(excess) > 0
     new_offsets = np.zeros(num_blocks + 1, np.int64)
-    new_sequence, new_weight = np.empty(len(sequence), np.int32), np.empty(len(sequence), np.float32)
+    new_sequence, sums = np.empty(len(sequence), np.int32), np.zeros((len(sequence), 3))
     total = 0
     for block in range(num_blocks):
         i, j, k = block // (coarser[1] * coarser[2]), block // coarser[2] % coarser[1], block % coarser[2]
@@ -144,17 +159,32 @@ def _joined(offsets: Any, sequence: Any, weight: Any, shape: Any, volume: Any, c
                         while at < total and new_sequence[at] != sequence[n]:
                             at += 1
                         if at == total:
-                            new_sequence[at], new_weight[at] = sequence[n], 0.0
+                            new_sequence[at] = sequence[n]
+                            sums[at] = 0.0
                             total += 1
-                        new_weight[at] += volume[child] * weight[n]
+                        held = volume[child] * weight[n]
+                        sums[at, 0] += held
+                        if passes:
+                            sums[at, 1] += held * excess[n]
+                            sums[at, 2] += held * num_walls[n]
         if free > 0.0:
-            new_weight[begin:total] /= free
-            order = np.argsort(-new_weight[begin:total])
+            order = np.argsort(-sums[begin:total, 0])
             new_sequence[begin:total] = new_sequence[begin:total][order]
-            new_weight[begin:total] = new_weight[begin:total][order]
-            while total > begin and new_weight[total - 1] < _LEAST_WEIGHT * new_weight[begin]:
+            sums[begin:total] = sums[begin:total][order]
+            while total > begin and sums[total - 1, 0] < _LEAST_WEIGHT * sums[begin, 0]:
                 total -= 1
+            for n in range(begin, total):
+                if sums[n, 0] > 0.0:
+                    sums[n, 1:] /= sums[n, 0]
+                sums[n, 0] /= free
         else:
             total = begin
         new_offsets[block + 1] = total
-    return new_offsets, new_sequence[:total].copy(), new_weight[:total].copy()
+    kept = total if passes else 0
+    return (
+        new_offsets,
+        new_sequence[:total].copy(),
+        sums[:total, 0].astype(np.float32),
+        sums[:kept, 1].astype(np.float32),
+        np.rint(sums[:kept, 2]).astype(np.int8),
+    )

@@ -36,7 +36,7 @@ class PathFactor(NamedTuple):
     kinds : ndarray of shape (k, 4)
         Whether the times are outliers, weight, path length [m] and its variance [m2], infinite where it is not known.
     direct, reflected : float
-        Weights of paths without and with reflections, from a line-of-sight indication.
+        Weights of direct paths and of all others, from a line-of-sight indication.
     outlier : float
         Density of the case that all of it is an outlier.
     """
@@ -73,7 +73,8 @@ def evaluate(
         Changed in place: the density; the fractions of it that times are outliers, and that all is; the information
         about the position [1 / m2].
     """
-    offsets, sequence, weight = paths
+    offsets, sequence, weight, excess, num_walls = paths
+    passes = len(excess) > 0
     images, mirrors, reflections, expected = geometry
     turn, zenith, cov, spreads, kinds, direct, reflected, outlier = factor
     density, late, lost, information = out
@@ -91,7 +92,7 @@ def evaluate(
             if own * peak < _NEGLIGIBLE * (good + bad + outlier):
                 break
             s = sequence[path]
-            own *= direct if reflections[s] == 0 else reflected
+            own *= direct if reflections[s] == 0 and not (passes and num_walls[path] > 0) else reflected
             x, y, z = points[n, 0] - images[s, 0], points[n, 1] - images[s, 1], points[n, 2] - images[s, 2]
             square = max(x * x + y * y + z * z, spread, 1e-6)
             length = np.sqrt(square)
@@ -117,6 +118,8 @@ def evaluate(
                 else:
                     own *= _of_azimuth(azimuth_error, cov[0], spreads, blur / horizontal)
             added = 0.0
+            if passes:
+                length += excess[path]
             for k in range(len(kinds)):
                 of_length = own * kinds[k, 1]
                 if kinds[k, 3] < np.inf:

@@ -141,8 +141,9 @@ def test_components_are_told_by_the_reflections_of_the_table(hall_table: Table, 
     assert len(cells) > 5
     expected = [count == 0 for cell in cells for count in cell.num_reflections.tolist()]
     assert is_direct(lookup).tolist() == expected
-    by_hand = make_table(*pair(0.0)).parts["a"]
-    assert is_direct(look_up(by_hand.levels, NO_DIRECTION)).tolist() == [True, False]
+    obstructed = replace(pair(0.0)[0], num_walls=1)
+    by_hand = make_table(*pair(0.0), obstructed).parts["a"]
+    assert is_direct(look_up(by_hand.levels, NO_DIRECTION)).tolist() == [True, False, False]
 
 
 def test_a_receivers_word_decides_between_a_place_and_its_mirror_image(hall_app: RunningApp) -> None:

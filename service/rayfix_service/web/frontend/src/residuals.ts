@@ -44,7 +44,9 @@ export function explainFix(mirrors: Mirrors, site: Site, report: Report, fix: Fi
       const { origin } = mirrors;
       const [from, to] = [sub(vec(station.position), origin), sub(at, origin)];
       const path = explain(mirrors, from, to, heard, site.settings.max_reflections, most);
-      if (path !== null) paths.set(id, { ...path, points: path.points.map((p) => add(p, origin)) });
+      if (path === null) continue;
+      const placed = (at: Vec3): Vec3 => add(at, origin);
+      paths.set(id, { ...path, points: path.points.map(placed), crossings: path.crossings.map(placed) });
     }
   }
   const offset = clockOffset(report, paths);

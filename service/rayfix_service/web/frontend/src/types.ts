@@ -31,6 +31,8 @@ export interface StationInfo {
 export interface ViewerSettings {
   simulation: boolean;
   max_reflections: number;
+  /** Materials of the scene that let signals through. */
+  open_materials: string[];
 }
 
 export interface Measurement {
@@ -133,13 +135,16 @@ export interface MixtureView {
     path_length_m: number;
     path_length_stdev_m: number;
     num_reflections: number;
+    num_walls: number;
   }[];
   by_reflections: number[];
+  by_walls: number[];
 }
 
 export interface Coverage {
   station_id: string;
   coverage: number[];
+  wall_coverage: number[];
   levels: { window_deg: number; num_cells: number; num_filled_cells: number; mass_by_reflections: number[] }[];
 }
 

@@ -75,7 +75,7 @@ export class Viewer {
     stage.setBounds(building.bounds);
     this.ground = building.bounds.min.z + mesh.origin[2];
     const extent = building.bounds.getSize(new Vector3());
-    this.mirrors = new Mirrors(mesh);
+    this.mirrors = new Mirrors(mesh, site.settings.open_materials);
     this.selection = new Selection(stage);
     this.targets = new Targets(stage, this.store);
     this.mixture = new Mixture(stage, site, this.mirrors);

@@ -57,6 +57,20 @@ describe("the path that explains a measurement", () => {
     expect(explain(ROOM, STATION, POSITION, heard([1, -9, 2]), 1, 30)).toBeNull();
   });
 
+  test("goes through a cupboard that lets signals through, straight and reflected behind it", () => {
+    const open = new Mirrors(boxes([[0, 0, 0], [5, 4, 3]], [[2, 1, 0], [3, 2, 3]]), ["material 1"]);
+    const straight = explain(open, STATION, POSITION, heard(POSITION), 2, 30)!;
+    expect(straight.numReflections).toBe(0);
+    expect(straight.points).toEqual([STATION, POSITION]);
+    expect(straight.crossings.map((at) => Math.round(at[0] * 1e4) / 1e4)).toEqual([2, 3]);
+    // The wall x = 5 mirrors the position to (6, 1.5, 1); the way there passes the cupboard.
+    const behind = explain(open, STATION, POSITION, heard([6, 1.5, 1]), 1, 30)!;
+    expect(behind.numReflections).toBe(1);
+    expect(behind.points[1]![0]).toBeCloseTo(5, 5);
+    expect(behind.crossings).toHaveLength(2);
+    expect(explain(BLOCKED, STATION, POSITION, heard([6, 1.5, 1]), 1, 30)).toBeNull();
+  });
+
   test("fits an azimuth on the other side of the cut at 180 deg", () => {
     const station: Vec3 = [4, 1.5, 2];
     const straight = sub([1, 1.5, 1], station); // azimuth 180 deg

@@ -38,11 +38,21 @@ describe("the scene as mirrors", () => {
   });
 
   test("nothing is between points of an empty room; a cupboard is between those on both sides of it", () => {
-    expect(new Mirrors(ROOM).free([1, 1.5, 1], [4, 1.5, 1])).toBe(true);
+    expect(new Mirrors(ROOM).between([1, 1.5, 1], [4, 1.5, 1])).toEqual([]);
     const mirrors = new Mirrors(FURNISHED);
-    expect(mirrors.free([1, 1.5, 1], [4, 1.5, 1])).toBe(false);
-    expect(mirrors.free([1, 1.5, 2.5], [4, 1.5, 2.5])).toBe(true);
-    expect(mirrors.free([1, 1, 1], [1, 1, 1])).toBe(true);
+    expect(mirrors.between([1, 1.5, 1], [4, 1.5, 1])).toBeNull();
+    expect(mirrors.between([1, 1.5, 2.5], [4, 1.5, 2.5])).toEqual([]);
+    expect(mirrors.between([1, 1, 1], [1, 1, 1])).toEqual([]);
+  });
+
+  test("a cupboard that lets signals through is passed at two sides, each counted once", () => {
+    const mirrors = new Mirrors(FURNISHED, ["material 1"]);
+    const found = mirrors.between([1, 1.5, 1], [4, 1.5, 1])!;
+    expect(found.map((at) => Math.round(at[0] * 1e5) / 1e5)).toEqual([2, 3]);
+    // Through the common edge of a side's two triangles, too.
+    expect(mirrors.between([1, 1.5, 1], [4, 1.5, 1])).toHaveLength(2);
+    const walls = new Mirrors(FURNISHED, ["material 0"]);
+    expect(walls.between([1, 1.5, 1], [4, 1.5, 1])).toBeNull();
   });
 
   test("a ray of 45 deg in a room: exact points", () => {

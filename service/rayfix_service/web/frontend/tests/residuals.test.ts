@@ -70,7 +70,7 @@ describe("a fix explained", () => {
     const site: Site = {
       table: { name: "", table_id: "", software_version: "", num_components: 0, site: { name: "", north_deg: 0, max_path_length_m: 30 } },
       stations: [station(add(STATION, origin))],
-      settings: { simulation: false, max_reflections: 2 },
+      settings: { simulation: false, max_reflections: 2, open_materials: [] },
     };
     return explainFix(new Mirrors(mesh), site, report, fix, add(POSITION, origin));
   }

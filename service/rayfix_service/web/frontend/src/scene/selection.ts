@@ -108,6 +108,7 @@ export class Selection {
       lines.push({ points, colour, width: 2.6, opacity: 0.5, throughWalls: true });
       lines.push({ points, colour, width: 3.2, opacity: 1, throughWalls: false });
       for (const point of points.slice(1, -1)) dots.push({ position: point, colour, diameter: 9 });
+      for (const crossing of path.crossings) dots.push({ position: this.stage.local(crossing), colour, diameter: 5 });
     }
     return lines;
   }

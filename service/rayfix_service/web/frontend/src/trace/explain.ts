@@ -2,8 +2,9 @@
  * Which path explains what a station measured of a position.
  *
  * Rays around the measured direction tell which reflection sequences can be; for each of them the path to the position
- * is exact by mirroring the position (image method). Of those that nothing blocks, the one that fits the measured
- * angles and length best is the explanation.
+ * is exact by mirroring the position (image method). It goes straight through walls that let signals through; what these
+ * add to its length is left out. Of the paths that nothing opaque blocks, the one that fits the measured angles and
+ * length best is the explanation.
  */
 
 import { DEG, anglesOf, direction, length, sub, unit, wrap } from "../numeric";
@@ -27,6 +28,8 @@ export interface Explanation {
   azimuth: number;
   zenith: number;
   numReflections: number;
+  /** Where it passes walls, in order from the station. */
+  crossings: Vec3[];
   /** Squared misfit in standard deviations. */
   misfit: number;
 }
@@ -49,9 +52,7 @@ export function explain(
   let best = consider(mirrors, station, position, heard, []);
   const seen = new Set<string>([""]);
   for (const ray of raysOf(heard)) {
-    const { planes } = mirrors.follow(station, ray, maxReflections, maxLength);
-    for (let n = 1; n <= planes.length; n++) {
-      const sequence = planes.slice(0, n);
+    for (const sequence of mirrors.sequences(station, ray, maxReflections, maxLength)) {
       const key = sequence.join();
       if (seen.has(key)) continue;
       seen.add(key);
@@ -77,15 +78,10 @@ function consider(
   const { azimuth, zenith } = anglesOf(straight);
   const misfit = misfitOf(heard, azimuth, zenith, total);
   if (!(misfit < WORST)) return null;
-  if (sequence.length === 0) {
-    if (!mirrors.free(station, position)) return null;
-    return { points: [station, position], length: total, azimuth, zenith, numReflections: 0, misfit };
-  }
-  const traced = mirrors.follow(station, unit(straight), sequence.length, total);
-  const same = sequence.every((plane, n) => traced.planes[n] === plane);
-  const end = traced.points[traced.points.length - 1]!;
-  if (!same || length(sub(end, position)) > 1e-3 * (1 + total)) return null;
-  return { points: traced.points, length: total, azimuth, zenith, numReflections: sequence.length, misfit };
+  const way = mirrors.along(station, unit(straight), sequence, total);
+  if (way === null || length(sub(way.points.at(-1)!, position)) > 1e-3 * (1 + total)) return null;
+  const points = [...way.points.slice(0, -1), position];
+  return { points, crossings: way.crossings, length: total, azimuth, zenith, numReflections: sequence.length, misfit };
 }
 
 function misfitOf(heard: Heard, azimuth: number, zenith: number, total: number): number {

@@ -2,6 +2,7 @@
 
 import { bar, h, replace, swatch } from "../dom";
 import type { ExplainedFix, Residual } from "../residuals";
+import type { Explanation } from "../trace/explain";
 import { deviation } from "../rounding";
 import { percent } from "../scene/selection";
 import { hex, theme } from "../theme";
@@ -122,7 +123,7 @@ export class FixPanel {
     const frame = m.type === "aoa" ? (m.frame ?? "scene") : undefined;
     const outlier = residual.outlierProbability ?? 0;
     const className = !residual.used ? "unused" : outlier > 0.5 ? "outlier" : "";
-    const how = path ? (path.numReflections === 0 ? "direct" : `${path.numReflections} refl.`) : "no path found";
+    const how = path ? wayOf(path) : "no path found";
     const station = m.reference_station_id ? `${m.station_id} − ${m.reference_station_id}` : m.station_id;
     const meter = h("span", { className: "meter", title: sigmas === null ? "" : `${sigmas.toFixed(1)} standard deviations` });
     if (sigmas !== null) {
@@ -155,3 +156,10 @@ const lines = (texts: readonly string[]): HTMLElement[] => texts.map((text) => h
 
 const swatchOf = (reflections: number | undefined): HTMLElement | null =>
   reflections === undefined ? null : swatch(hex(theme.reflections(reflections)));
+
+/** What a path does on its way: reflections and walls. */
+function wayOf({ numReflections, crossings }: Explanation): string {
+  if (crossings.length === 0) return numReflections === 0 ? "direct" : `${numReflections} refl.`;
+  const walls = `${crossings.length} wall${crossings.length === 1 ? "" : "s"}`;
+  return numReflections === 0 ? `straight, ${walls}` : `${numReflections} refl., ${walls}`;
+}

@@ -160,7 +160,15 @@ export class Inspector {
       !view.in_field_of_view && h("p", { className: "warning" }, "Outside of the station's field of view."),
       view.num_components === 0
         ? h("p", { className: "muted" }, "No ray comes from there.")
-        : h("div", {}, h("h3", {}, "This direction, by reflections"), shares(view.by_reflections), this.components(view)),
+        : h(
+            "div",
+            {},
+            h("h3", {}, "This direction, by reflections"),
+            shares(view.by_reflections),
+            view.by_walls.length > 1 && h("h3", {}, "By walls passed"),
+            view.by_walls.length > 1 && shares(view.by_walls, undefined, wallsPassed),
+            this.components(view),
+          ),
     );
   }
 
@@ -174,7 +182,12 @@ export class Inspector {
           {},
           h("td", {}, swatch(hex(theme.reflections(component.num_reflections))), percent(component.probability)),
           h("td", {}, pointText(p, component.covariance_m2)),
-          h("td", {}, withDeviation(component.path_length_m, component.path_length_stdev_m, "")),
+          h(
+            "td",
+            {},
+            withDeviation(component.path_length_m, component.path_length_stdev_m, ""),
+            component.num_walls > 0 && h("small", {}, ` ${wallsPassed(component.num_walls)}`),
+          ),
         ),
       );
     }
@@ -190,25 +203,35 @@ export class Inspector {
   }
 
   private describeCoverage(coverage: Coverage): void {
-    const each = coverage.coverage.map((share, n) => share - (n > 0 ? coverage.coverage[n - 1]! : 0));
-    const rest = 1 - (coverage.coverage[coverage.coverage.length - 1] ?? 0);
+    const straight = coverage.wall_coverage;
     replace(
       this.reach,
       h("h3", {}, "Free space that this station hears"),
-      shares(each, rest),
+      shares(steps(coverage.coverage), missing(coverage.coverage)),
+      straight.length > 0 && h("h3", {}, "By straight paths through walls"),
+      straight.length > 0 &&
+        shares(steps(straight), missing(straight), (n) => (n === 0 ? "line of sight" : wallsPassed(n))),
     );
   }
 }
 
 const name = (n: number): string => (n === 0 ? "direct" : n === 1 ? "1 reflection" : `${n} reflections`);
 
-/** Bars of shares by the number of reflections. */
-function shares(values: readonly number[], rest?: number): HTMLElement {
+const wallsPassed = (n: number): string => (n === 0 ? "no wall" : n === 1 ? "1 wall" : `${n} walls`);
+
+/** Increments of cumulative shares. */
+const steps = (shares: readonly number[]): number[] => shares.map((share, n) => share - (n > 0 ? shares[n - 1]! : 0));
+
+/** What cumulative shares lack of all. */
+const missing = (shares: readonly number[]): number => 1 - (shares[shares.length - 1] ?? 0);
+
+/** Bars of shares by the number of reflections, or of what `named` says. */
+function shares(values: readonly number[], rest?: number, named = name): HTMLElement {
   const list = h("ul", { className: "candidates shares" });
   values.forEach((share, n) => {
     const meter = bar(share);
     (meter.firstElementChild as HTMLElement).style.background = hex(theme.reflections(n));
-    list.append(h("li", {}, h("span", {}, name(n)), meter, h("span", { className: "number" }, percent(share))));
+    list.append(h("li", {}, h("span", {}, named(n)), meter, h("span", { className: "number" }, percent(share))));
   });
   if (rest !== undefined && rest > 0.005) {
     list.append(h("li", { className: "muted" }, h("span", {}, "not at all"), bar(rest), h("span", { className: "number" }, percent(rest))));
