@@ -9,12 +9,16 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from rayfix_offline.rays.launch import launch
+from rayfix_offline.rays.pathmap import fill_path_map
+from rayfix_offline.rays.pathprior import fill_path_prior
+from rayfix_offline.rays.rays import sample_rays
 from rayfix_offline.rays.segments import Segments
 from rayfix_offline.rays.settings import RaySettings
 from rayfix_offline.scene.engine import EmbreeEngine
 from rayfix_offline.scene.slabs import excess_length, slab_power
 from rayfix_offline.scene.walls import Walls, opaque_walls
 from rayfix_offline.twin.planes import merge_coplanar
+from rayfix_tables.freespace import FreeSpace
 from tests.support.scenes.shapes import box, quad
 
 GLASS = 6.0 - 0.1j
@@ -241,3 +245,26 @@ def test_all_branches_of_a_naive_trace(unit_vectors: Callable[[int, int], NDArra
         )
         expected = naive(*built, station, heading, 2)
         np.testing.assert_allclose(sorted(found), sorted(expected), rtol=0, atol=1e-7)
+
+
+def test_the_path_map_behind_a_sheet() -> None:
+    """One direct path, which passes one wall; its excess length is that of the angle of incidence at the middle."""
+    rays = sample_rays(0.01, np.random.default_rng(4))
+    segments = run(scene(sheet_at(3.0), thickness=0.1), rays.directions)
+    space = FreeSpace(origin=np.array([0.0, -2.0, -1.0]), voxel_size=0.1, free=np.ones((90, 40, 20), bool))
+    prior = fill_path_prior(rays, segments, space, exponent=2.0, refinement=2)
+    paths = fill_path_map(rays, segments, prior, exponent=2.0, kind="power", least_share=1e-3)
+    compared = 0
+    for voxel in np.ndindex(paths.shape):
+        own = slice(*paths.offsets[(n := int(np.ravel_multi_index(voxel, paths.shape))) : n + 2])
+        apart = paths.origin + paths.voxel_size * (np.array(voxel) + 0.5) - (1.0, 0.1, 0.2)
+        if abs(apart[0] - 2.0) < 0.2 or np.linalg.norm(apart) < 0.3:  # the sheet is in the voxel, or the station
+            continue
+        behind = apart[0] > 2.0
+        assert paths.sequence[own].tolist() == [0]
+        assert paths.weight[own] == pytest.approx([1.0])
+        assert paths.num_walls[own].tolist() == [int(behind)]
+        expected = slab(0.1, float(apart[0] / np.linalg.norm(apart)))[2] if behind else 0.0
+        assert paths.excess[own] == pytest.approx([expected], abs=2e-3)
+        compared += 1
+    assert compared > 3000
