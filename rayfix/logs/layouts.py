@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic_core import to_json
+
 from rayfix.extras import needs_extra
 from rayfix_tables.errors import ReportError
 
@@ -123,9 +125,9 @@ def piece(document: Mapping[str, Any], layout: Layout, *, track: bool) -> bytes:
     """Write one fix; in GeoJSON, commas go between pieces."""
     match layout:
         case "jsonl":
-            return json.dumps(document, separators=(",", ":")).encode() + b"\n"
+            return to_json(document) + b"\n"
         case "parquet":
-            return json.dumps(flat(document), separators=(",", ":")).encode() + b"\n"
+            return to_json(flat(document)) + b"\n"
         case "csv":
             row, text = flat(document), io.StringIO()
             values = [row.get(name) for name in columns_of(track=track)]

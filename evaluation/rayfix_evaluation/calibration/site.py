@@ -7,13 +7,13 @@ from typing import TypeVar
 import numpy as np
 
 from rayfix_evaluation.calibration.measured import KnownReport, StationErrors, errors_of
+from rayfix_evaluation.calibration.ranges import calibrate_ranges
 from rayfix_evaluation.calibration.spread import Spread
 from rayfix_evaluation.calibration.station import (
     AngleCalibration,
     RangeCalibration,
     StationCalibration,
     calibrate_angles,
-    calibrate_ranges,
     calibrated_station,
     chosen_models,
     num_places,

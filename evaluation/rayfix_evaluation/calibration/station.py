@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rayfix_evaluation.calibration.gaussian_process import Hyperparameters, Process, Samples, fit_process
-from rayfix_evaluation.calibration.measured import AngleErrors, RangeErrors, turn_derivatives
+from rayfix_evaluation.calibration.measured import AngleErrors, turn_derivatives
 from rayfix_evaluation.calibration.spread import Spread, fit_spread, log_density
 from rayfix_tables.geometry.angles import local_to_scene
 from rayfix_tables.site import AngleBias, Deviations, Station, StationBias
@@ -22,7 +22,6 @@ __all__ = [
     "RangeCalibration",
     "StationCalibration",
     "calibrate_angles",
-    "calibrate_ranges",
     "calibrated_station",
     "chosen_models",
     "num_independent",
@@ -37,11 +36,11 @@ Model = Literal["none", "constant", "smooth"]
 
 MODELS: tuple[Model, ...] = ("none", "constant", "smooth")
 
-_MOST_SAMPLES = 200
+MOST_SAMPLES = 200
 """Means of measurements that the processes are conditioned on."""
 
 _FOLDS = 5
-_LEAST_GAIN = 2.0
+LEAST_GAIN = 2.0
 """Natural logarithms of held-out evidence by which a larger model must win."""
 
 _FAR = 5.0
@@ -54,7 +53,6 @@ _USUAL = _ANGLES, replace(_ANGLES, zenith_scale=25.0)
 reflections from floor and ceiling, which change with it."""
 _TURN_NAMES = ("x", "y", "z")
 _VOLUME = 360.0 * 180.0
-_RANGE_VOLUME = 50.0
 _TILT_RANGE = 120.0
 """Degrees of azimuth from which on tilts are looked for."""
 
@@ -173,7 +171,7 @@ class AngleTrial:
 
 def try_angles(errors: AngleErrors) -> AngleTrial:
     """Judge each model on places that it was not fitted to."""
-    folds = _folds(errors.place, errors.seconds)
+    folds = folds_of(errors.place, errors.seconds)
     _, place = np.unique(errors.place, return_inverse=True)
     count = np.bincount(place)
     residual, known, gain, evidence = {}, {}, {}, {}
@@ -274,9 +272,9 @@ def _fit(errors: AngleErrors, model: Model, chosen: NDArray[np.bool_] | None = N
     columns = 2 if _has_zenith(errors) else 1
     found = []
     for column in range(columns):
-        good = chosen & _near(errors.error[:, column], chosen)
+        good = chosen & without_outliers(errors.error[:, column], chosen)
         features = _features(errors, errors.true)[column]
-        samples = _means(errors, column, features, good)
+        samples = block_means(errors, column, features, good)
         found.append(_process(samples, model, _USUAL[column]))
     return tuple(found)
 
@@ -298,19 +296,19 @@ def _process(samples: Samples, model: Model, usual: Hyperparameters) -> Process:
     return fit_process(samples, usual, free=(*free, "correlated", "white", "time"))
 
 
-def _near(error: Array, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def without_outliers(error: Array, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Errors that are not so large that they must be outliers."""
     middle = np.median(error[chosen])
     scale = 1.4826 * np.median(np.abs(error[chosen] - middle))
     return np.asarray(np.abs(error - middle) <= _FAR * max(float(scale), 1e-6) * 1.5)
 
 
-def _means(errors: AngleErrors, column: int, features: Array, chosen: NDArray[np.bool_]) -> Samples:
+def block_means(errors: AngleErrors, column: int, features: Array, chosen: NDArray[np.bool_]) -> Samples:
     """Average measurements that follow each other at a place, so that few stand for many."""
     rows = np.column_stack([errors.true, features, errors.error[:, column], errors.seconds])[chosen]
     order = np.lexsort((errors.seconds[chosen], errors.place[chosen]))
     rows, place = rows[order], errors.place[chosen][order]
-    size = max(1, int(np.ceil(len(rows) / _MOST_SAMPLES)))
+    size = max(1, int(np.ceil(len(rows) / MOST_SAMPLES)))
     starts_place = np.append(True, place[1:] != place[:-1])
     first = np.maximum.accumulate(np.where(starts_place, np.arange(len(rows)), 0))
     _, group = np.unique(np.column_stack([place, (np.arange(len(rows)) - first) // size]), axis=0, return_inverse=True)
@@ -322,7 +320,7 @@ def _means(errors: AngleErrors, column: int, features: Array, chosen: NDArray[np
     )
 
 
-def _folds(place: NDArray[np.int64], seconds: Array) -> NDArray[np.int64]:
+def folds_of(place: NDArray[np.int64], seconds: Array) -> NDArray[np.int64]:
     """Return the fold of each measurement: places that follow each other are left out together."""
     places, inverse = np.unique(place, return_inverse=True)
     begin = np.array([seconds[place == each].min() for each in places])
@@ -417,57 +415,6 @@ def _grid(errors: AngleErrors, processes: tuple[Process, ...], turn: Array | Non
 
 def _rows(degrees: Array) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in np.deg2rad(degrees).tolist())
-
-
-def calibrate_ranges(errors: RangeErrors) -> RangeCalibration:
-    """Find the range bias of a station, if it helps on places that it was not fitted to, and the spread of the rest."""
-    folds = _folds(errors.place, errors.seconds)
-    scatter = max(float(1.4826 * np.median(np.abs(errors.error - np.median(errors.error)))), 1e-4)
-    held_out: dict[Model, Array] = {"none": errors.error[:, None]}
-    residual = errors.error.copy()
-    for fold in np.unique(folds):
-        out = folds == fold
-        residual[out] -= _range_process(errors, ~out, scatter).constants[0][0]
-    held_out["constant"] = residual[:, None]
-    spreads = {model: fit_spread(found, _RANGE_VOLUME) for model, found in held_out.items()}
-    evidence: dict[Model, float] = {
-        model: float(log_density(found, spreads[model], _RANGE_VOLUME).mean()) for model, found in held_out.items()
-    }
-    effective = min(len(folds), _MOST_SAMPLES)
-    better = (evidence["constant"] - evidence["none"]) * effective > _LEAST_GAIN
-    model: Model = "constant" if better else "none"
-    process = _range_process(errors, np.ones(len(folds), bool), scatter)
-    mean, covariance = process.constants
-    scales = process.scales
-    share = scales.correlated**2 / (scales.correlated**2 + scales.white**2)
-    return RangeCalibration(
-        model=model,
-        evidence=evidence,
-        spread=spreads[model],
-        num_independent=num_independent(errors.seconds, errors.place, share),
-        bias=float(mean[0]) if better else 0.0,
-        bias_stdev=float(np.sqrt(covariance[0, 0])) if better else 0.0,
-        correlation_time=scales.time,
-        correlated_share=share,
-    )
-
-
-def _range_process(errors: RangeErrors, chosen: NDArray[np.bool_], scatter: float) -> Process:
-    angles = AngleErrors(
-        local=False,
-        true=np.column_stack([errors.true, errors.true]),
-        error=np.column_stack([errors.error, errors.error]),
-        stated=np.zeros((len(errors.error), 2)),
-        seconds=errors.seconds,
-        place=errors.place,
-    )
-    good = chosen & _near(errors.error, chosen)
-    samples = _means(angles, 0, np.ones((len(errors.error), 1)), good)
-    usual = Hyperparameters(
-        linear=1.0, amplitude=0.0, azimuth_scale=25.0, zenith_scale=25.0, correlated=0.6 * scatter, white=0.5 * scatter,
-        time=_ANGLES.time,
-    )  # fmt: skip
-    return fit_process(samples, usual, free=("correlated", "white", "time"))
 
 
 def calibrated_station(station: Station, angles: AngleCalibration | None, ranges: RangeCalibration | None) -> Station:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from rayfix_service.fusion.measurements.report import Angle, ErrorModel, Measurement, Range, Report, TimeOfArrival
 from rayfix_tables.site import AngleBias, Deviations, Rows, SiteInfo
 
-_STEPS = 30
+_STEPS = 60
 """Steps of the search for the true direction; each halves what is left of a constant bias."""
 
 _ENOUGH = 1e-7
@@ -84,7 +84,7 @@ class _Place:
 
     def azimuth_slope(self, rows: Rows) -> float:
         """Change with the azimuth; 0 beyond the grid."""
-        if self._width == 0.0 or not 0.0 < self._s < 1.0:
+        if self._width == 0.0:
             return 0.0
         low, high = rows[self._j], rows[min(self._j + 1, len(rows) - 1)]
         i = self._i
@@ -92,7 +92,7 @@ class _Place:
 
     def zenith_slope(self, rows: Rows) -> float:
         """Change with the zenith; 0 beyond the grid."""
-        if self._height == 0.0 or not 0.0 < self._t < 1.0:
+        if self._height == 0.0:
             return 0.0
         return (self._in_row(rows[self._j + 1]) - self._in_row(rows[self._j])) / self._height
 
@@ -102,12 +102,13 @@ class _Place:
 
 
 def _cell(axis: tuple[float, ...], value: float) -> tuple[int, float, float]:
-    """Cell of an axis: its index, where in it, from 0 to 1, and its width."""
+    """Cell of an axis: its index, where in it, from 0 to 1, and its width, 0 beyond the axis."""
     if len(axis) == 1:
         return 0, 0.0, 0.0
     i = min(max(bisect_right(axis, value) - 1, 0), len(axis) - 2)
     width = axis[i + 1] - axis[i]
-    return i, min(max((value - axis[i]) / width, 0.0), 1.0), width
+    beyond = not axis[0] <= value <= axis[-1]
+    return i, min(max((value - axis[i]) / width, 0.0), 1.0), 0.0 if beyond else width
 
 
 def with_deviations(report: Report, site: SiteInfo) -> Report:
