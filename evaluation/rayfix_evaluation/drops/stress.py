@@ -131,7 +131,7 @@ def move_scene(
 
 def _parts(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.int64]:
     """Label the connected part of the mesh of each vertex, shape (n_vertices,)."""
-    _, place = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
+    place = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)[1].reshape(-1)  # a column with NumPy 2.0
     edges = place[np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])]
     size = int(place.max()) + 1
     graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(size, size))

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rayfix_offline.twin.planes import Planes, merge_coplanar
 from rayfix_offline.twin.settings import TwinSettings
-from tests.support.scenes.shapes import box, cut_in_three, quad
+from tests.support.scenes.shapes import box, cut_in_three, quad, random_rotation
 
 EXACT = 1e-12  # m, of coordinates of a few metres
 
@@ -130,7 +130,7 @@ def test_splitting_and_reordering_change_nothing(clutter: NDArray[np.float64], s
 @given(st.integers(0, 2**32 - 1))
 def test_rigid_motion_moves_the_planes(clutter: NDArray[np.float64], seed: int) -> None:
     rng = np.random.default_rng(seed)
-    rotation, shift = Rotation.random(rng=rng), rng.uniform(-100, 100, 3)
+    rotation, shift = random_rotation(rng), rng.uniform(-100, 100, 3)
     moved = rotation.apply(clutter.reshape(-1, 3)).reshape(-1, 3, 3) + shift
     before, after = merge_coplanar(clutter), merge_coplanar(moved)
     assert same_grouping(after.face_planes, before.face_planes)

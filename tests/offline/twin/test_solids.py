@@ -17,7 +17,7 @@ from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.solids import Part, is_inside, map_free_space, split_parts, touched
 from rayfix_tables.freespace import FreeSpace
 from tests.support.scenes.rooms import scene_of
-from tests.support.scenes.shapes import box
+from tests.support.scenes.shapes import box, random_rotation
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -51,7 +51,7 @@ def test_parts_of_a_room(clutter: NDArray[np.float64]) -> None:
 def test_volume_does_not_depend_on_the_place(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size = rng.uniform(0.1, 3.0, 3)
-    triangles = moved(box(-size / 2, size / 2), Rotation.random(rng=rng), rng.uniform(-1e3, 1e3, 3))
+    triangles = moved(box(-size / 2, size / 2), random_rotation(rng), rng.uniform(-1e3, 1e3, 3))
     (part,) = parts_of(scene_of(thing=triangles))
     assert part.closed
     assert part.volume == pytest.approx(np.prod(size), rel=1e-9)
@@ -109,7 +109,7 @@ def test_inside_a_box(seed: int) -> None:
     """Whatever its place, its turn and the way its triangles face."""
     rng = np.random.default_rng(seed)
     size = rng.uniform(0.2, 4.0, 3)
-    rotation, shift = Rotation.random(rng=rng), rng.uniform(-50, 50, 3)
+    rotation, shift = random_rotation(rng), rng.uniform(-50, 50, 3)
     triangles = moved(box(-size / 2, size / 2), rotation, shift)
     for i in np.flatnonzero(rng.random(12) < 0.5):
         triangles[i] = triangles[i, ::-1]
@@ -164,7 +164,7 @@ def test_inside_a_hollow_shell() -> None:
 def test_touching_a_box(seed: int) -> None:
     """Points on the surface, moved along the outward normal by up to 3 mm; 1 mm counts as on it."""
     rng = np.random.default_rng(seed)
-    size, rotation, shift = rng.uniform(0.2, 4.0, 3), Rotation.random(rng=rng), rng.uniform(-50, 50, 3)
+    size, rotation, shift = rng.uniform(0.2, 4.0, 3), random_rotation(rng), rng.uniform(-50, 50, 3)
     triangles = moved(box(-size / 2, size / 2), rotation, shift)
     local = rng.uniform(-0.5, 0.5, (20, 3)) * size
     axis, sign = rng.integers(0, 3, 20), rng.choice([-1.0, 1.0], 20)
@@ -273,7 +273,7 @@ def test_free_space_around_turned_boxes(seed: int) -> None:
     rng = np.random.default_rng(seed)
     objects, solid = {"room": box((-3, -3, -3), (3, 3, 3))}, []
     for name in ("a", "b"):
-        size, rotation, shift = rng.uniform(0.5, 2.0, 3), Rotation.random(rng=rng), rng.uniform(-1.0, 1.0, 3)
+        size, rotation, shift = rng.uniform(0.5, 2.0, 3), random_rotation(rng), rng.uniform(-1.0, 1.0, 3)
         objects[name] = moved(box(-size / 2, size / 2), rotation, shift)
         solid.append((size, rotation, shift))
     free, centres = free_space(scene_of(**objects), enclosing=[True, False, False], voxel_size=0.25)

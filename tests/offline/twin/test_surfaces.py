@@ -8,7 +8,6 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from rayfix_offline.twin.mesh import Mesh
 from rayfix_offline.twin.planes import Planes, merge_coplanar
@@ -16,7 +15,7 @@ from rayfix_offline.twin.settings import TwinSettings
 from rayfix_offline.twin.surfaces import join_facets
 from rayfix_offline.twin.topology import number_rows
 from tests.support.scenes.rooms import scene_of
-from tests.support.scenes.shapes import box
+from tests.support.scenes.shapes import box, random_rotation
 
 Triangles = NDArray[np.float64]
 
@@ -167,7 +166,7 @@ def test_motion_and_facing_change_nothing(seed: int) -> None:
     """Of the grouping, for the same order of triangles."""
     rng = np.random.default_rng(seed)
     triangles = pillar(128)
-    rotation, shift = Rotation.random(rng=rng), rng.uniform(-10, 10, 3)
+    rotation, shift = random_rotation(rng), rng.uniform(-10, 10, 3)
     moved = rotation.apply(triangles.reshape(-1, 3)).reshape(-1, 3, 3) + shift
     turned = rng.random(len(moved)) < 0.5
     moved[turned] = moved[turned, ::-1]

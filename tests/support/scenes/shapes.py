@@ -2,8 +2,14 @@
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+
+
+def random_rotation(rng: np.random.Generator) -> Rotation:
+    """Draw a rotation, all equally likely."""
+    return Rotation.from_quat(rng.standard_normal(4))
 
 
 def quad(*corners: ArrayLike) -> Array:
