@@ -126,7 +126,9 @@ def test_no_report_of_any_kind_takes_minutes(many: Locator, kind: str) -> None:
 
 
 def test_what_the_bounds_left_out_is_said(hall_table_path: Path) -> None:
+    """Of Gaussians, which answer wide errors where a table has no path map."""
     table = Table.open(hall_table_path)
+    table = replace(table, parts={name: replace(part, paths=None) for name, part in table.parts.items()})
     names = [station.id for station in table.site.stations]
     ranges: list[Measurement] = [
         LogRange(station_id=name, path_length=6.0 + n, log_stdev=0.5) for n, name in enumerate(names)

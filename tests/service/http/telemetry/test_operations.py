@@ -253,7 +253,7 @@ def test_outcomes_of_measurements_are_told_apart():
 def test_the_table_and_readiness_are_told(service: RunningApp, hall_table_path: Path):
     figures = figures_of(service)
     table = Table.open(hall_table_path)
-    labels = ("2", "hall", table.software_version, "hall", table.table_id)
+    labels = (str(FORMAT_VERSION), "hall", table.software_version, "hall", table.table_id)
     assert table.format_version == FORMAT_VERSION
     assert figures["rayfix_table_info", *labels] == 1
     assert figures["rayfix_ready",] == 1
