@@ -91,7 +91,8 @@ class Locator:
 
         def relocate(changed: Report, turns: Mapping[str, float]) -> Fix:
             changed, site = turned_report(changed, self.table.site, turns)
-            product = self._fusion.product(changed, stop, site=site)
+            # Times alone decide on turns, and the search was judged with their Gaussians.
+            product = self._fusion.product(changed, stop, site=site, on_path_map=False)
             return make_fix(changed, product, self.table, self.settings, stop)
 
         turns = find_turns(report, fix, self.table.site, relocate, most_fixes=self.settings.most_turn_fixes)

@@ -69,7 +69,9 @@ class Fusion:
         seconds = self._quadrature.seconds(report) if len(report.measurements) <= _MOST_MEASUREMENTS else None
         return self._cost.seconds(report) if seconds is None else seconds
 
-    def product(self, report: Report, stop: Stop = NEVER, *, site: SiteInfo | None = None) -> Product:
+    def product(
+        self, report: Report, stop: Stop = NEVER, *, site: SiteInfo | None = None, on_path_map: bool = True
+    ) -> Product:
         """Multiply the likelihoods of the measurements of a report.
 
         Parameters
@@ -77,6 +79,8 @@ class Fusion:
         report : Report
         site : SiteInfo, optional
             Whose stations the report is of; the table's by default.
+        on_path_map : bool
+            Whether wide errors are integrated on the path map; otherwise Gaussians are multiplied.
         stop : Stop
             Ends it early, from another thread.
 
@@ -90,7 +94,7 @@ class Fusion:
         site = site or self.table.site
         sorted_report = sort_report(with_deviations(report, site), site)
         prior = self._prior(report)
-        if self._quadrature.suits(sorted_report):
+        if on_path_map and self._quadrature.suits(sorted_report):
             return self._integrated(sorted_report, prior, stop)
         return self._multiplied(sorted_report, prior, stop)
 
