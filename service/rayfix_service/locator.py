@@ -11,7 +11,7 @@ from rayfix_service.fusion.diagnosis.suspects import suspects
 from rayfix_service.fusion.diagnosis.turned import find_turns, turn_warning, turned_report
 from rayfix_service.fusion.fusion import Fusion
 from rayfix_service.fusion.measurements.checks import check_report
-from rayfix_service.fusion.measurements.report import Angle, Range, Report
+from rayfix_service.fusion.measurements.report import Angle, Range, Report, TimeOfArrival
 from rayfix_service.fusion.posterior.credible import CredibleRegions
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.posterior.fixes import Product, make_fix
@@ -176,14 +176,20 @@ class Locator:
 
     def warm_up(self) -> None:
         """Compile the kernels and prepare reports without angles, by locating a report of each kind."""
-        window = self.table.parts[self.table.site.stations[0].id].levels[0].window
-        for station in self.table.site.stations:
+        stations = self.table.site.stations
+        window = self.table.parts[stations[0].id].levels[0].window
+        for station in stations:
             length = Range(station_id=station.id, path_length=5.0, stdev=0.5)
             self.locate(Report(measurements=(length,)))
             self.seconds(Report(measurements=(length,)))
-            for stdev in (0.5 * window, window):  # looked up in one cell and in several
+            for stdev in (0.5 * window, window, 2.0 * window):  # looked up in one cell, in several, on the path map
                 angle = Angle(station_id=station.id, azimuth=0.5, zenith=1.8, azimuth_stdev=stdev, zenith_stdev=stdev)
                 self.locate(Report(measurements=(angle, length)))
+            if station is not stations[0]:  # lengths of a station whose angle was not measured; unknown clocks
+                arrival = TimeOfArrival(station_id=station.id, path_length=5.0, stdev=0.5)
+                at_first = Range(station_id=stations[0].id, path_length=5.0, stdev=0.5)
+                self.locate(Report(measurements=(angle, at_first)))
+                self.locate(Report(measurements=(angle, arrival, replace(arrival, station_id=stations[0].id))))
         points = DrawnPoints(mean=np.zeros((1, 3)), root=np.eye(3)[None], owner=np.zeros(8, np.int16))
         regions = CredibleRegions(position=np.zeros(3), covariance=np.eye(3), points=points, share=1.0)
         regions.upright_ellipsoid(0.5)

@@ -25,7 +25,7 @@ from tests.support.running.server_process import start_server
 from tests.support.running.talking_process import TalkingProcess
 
 RUN = """\
-    import os, sys, time
+    import os, signal, sys
     from rayfix_service.server import workers
 
     workers._LOOK_SECONDS, workers._SILENT_LOOKS = 0.02, {silent_looks}
@@ -90,7 +90,7 @@ def ends(pid: int) -> bool:
 
 
 def test_a_worker_that_dies_or_hangs_is_replaced_and_all_end_together():
-    with service(RUN.format(work="time.sleep(60)", silent_looks=100)) as run:
+    with service(RUN.format(work="signal.pause()", silent_looks=400)) as run:
         first, second = run.worker(), run.worker()
         os.kill(first, signal.SIGKILL)
         third = run.worker()
@@ -107,7 +107,7 @@ def test_a_worker_that_dies_or_hangs_is_replaced_and_all_end_together():
 
 
 def test_workers_whose_service_is_killed_end_by_themselves():
-    with service(RUN.format(work="time.sleep(60)", silent_looks=MANY_LOOKS)) as run:
+    with service(RUN.format(work="signal.pause()", silent_looks=MANY_LOOKS)) as run:
         pids = [run.worker(), run.worker()]
         run.process.kill()
         assert all(ends(pid) for pid in pids)

@@ -121,12 +121,24 @@ class StationPaths:
     """
 
     def __init__(self, paths: PathMap, tree: BlockTree) -> None:
-        self.images, self.mirrors, self.num_reflections = paths.images, paths.mirrors, paths.num_reflections
-        self.levels = [BlockPaths(paths.offsets, paths.sequence, paths.weight, paths.excess, paths.num_walls)]
+        self.images, self.mirrors = _read_only(paths.images), _read_only(paths.mirrors)
+        self.num_reflections = _read_only(paths.num_reflections)
+        of_voxels = BlockPaths(paths.offsets, paths.sequence, paths.weight, paths.excess, paths.num_walls)
+        self.levels = [_only_read(of_voxels)]
         for finer, coarser in zip(tree.levels, tree.levels[1:], strict=False):
-            self.levels.append(
-                BlockPaths(*_joined(*self.levels[-1], np.array(finer.shape), finer.volume, np.array(coarser.shape)))
-            )
+            joined = _joined(*self.levels[-1], np.array(finer.shape), finer.volume, np.array(coarser.shape))
+            self.levels.append(_only_read(BlockPaths(*joined)))
+
+
+def _only_read(paths: BlockPaths) -> BlockPaths:
+    return BlockPaths(*(_read_only(array) for array in paths))
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """View of an array that cannot be written to, as those of a table are: kernels are compiled for one kind only."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 @numba.njit(cache=True, nogil=True)
