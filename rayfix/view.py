@@ -7,6 +7,7 @@ import json
 import re
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,25 @@ from rayfix_tables.table import Table
 _PAGES = (".html", ".htm")
 
 
-def write_view(table_path: Path, output: Path, report_path: Path | None = None) -> int:
-    """Write a page that shows a site and the fixes of a file's reports.
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """What a page shows.
+
+    Attributes
+    ----------
+    num_fixes : int
+    num_of_other_table : int
+        Fixes of a log that were made with another table.
+    """
+
+    num_fixes: int
+    num_of_other_table: int = 0
+
+
+def write_view(
+    table_path: Path, output: Path, report_path: Path | None = None, *, recording: Mapping[str, Any] | None = None
+) -> View:
+    """Write a page that shows a site, and the fixes of a file's reports or of a log.
 
     Parameters
     ----------
@@ -34,11 +52,12 @@ def write_view(table_path: Path, output: Path, report_path: Path | None = None) 
         The page, HTML.
     report_path : pathlib.Path, optional
         A report in the form of ``POST /v1/positions``, or several in ``{"reports": [...]}``.
+    recording : mapping, optional
+        Fixes of a log, which the page plays; see :func:`rayfix.played.read_recording`.
 
     Returns
     -------
-    int
-        Number of fixes in the page.
+    View
 
     Raises
     ------
@@ -56,12 +75,14 @@ def write_view(table_path: Path, output: Path, report_path: Path | None = None) 
     if report_path is not None:
         locator.warm_up()  # otherwise compute_ms of the first fix would include compilation
     events = [] if report_path is None else [_event(locator, document) for document in read_reports(report_path)]
-    page = render_view(table_path.stem, table, events)
+    page = render_view(table_path.stem, table, events, recording)
     try:
         output.write_text(page, encoding="utf-8")
     except OSError as error:
         raise ViewError(f"{output} cannot be written ({error.strerror}); give another file") from error
-    return len(events)
+    played = [] if recording is None else recording["events"]
+    others = sum(event["fix"].get("table_id") != table.table_id for event in played)
+    return View(num_fixes=len(events) + len(played), num_of_other_table=others)
 
 
 def read_reports(path: Path) -> list[Mapping[str, Any]]:
@@ -84,7 +105,9 @@ def read_reports(path: Path) -> list[Mapping[str, Any]]:
     return documents
 
 
-def render_view(name: str, table: Table, events: list[dict[str, Any]]) -> str:
+def render_view(
+    name: str, table: Table, events: list[dict[str, Any]], recording: Mapping[str, Any] | None = None
+) -> str:
     """Return the page as text.
 
     Parameters
@@ -94,6 +117,8 @@ def render_view(name: str, table: Table, events: list[dict[str, Any]]) -> str:
     table : Table
     events : list of dict
         Reports with their fixes, in the form of the viewer's events.
+    recording : mapping, optional
+        Fixes of a log, which the page plays.
 
     Raises
     ------
@@ -109,7 +134,7 @@ def render_view(name: str, table: Table, events: list[dict[str, Any]]) -> str:
         "settings": viewer_settings(table, simulation=False).model_dump(mode="json"),
         "scene_base64": base64.b64encode(write_glb(table.scene, table.site.name)).decode(),
         "events": events,
-    }
+    } | ({} if recording is None else {"recording": recording})
     return inline(STATIC, data, title=f"rayfix · {table.site.name}")
 
 

@@ -58,6 +58,11 @@ def add_commands(add: AddCommand) -> None:
     )
     add_log_arguments(locate)
     locate.add_argument("--track", action="store_true", help="follow the targets of logs from report to report")
+    locate.add_argument(
+        "--with-reports",
+        action="store_true",
+        help="write each fix's report beside it, into .jsonl; the viewer needs it",
+    )
     add_jobs_argument(locate, "processes that locate the reports of logs")
     add_progress_argument(locate)
 
@@ -142,6 +147,7 @@ def _locate_logs(options: argparse.Namespace) -> int:
         height=known_height(*(options.height or (None, None))),
         confidence=options.confidence,
         track=options.track,
+        with_reports=options.with_reports,
     )
     reading = log_reading(options, table)
     with stage_progress(enabled=not options.no_progress) as progress:

@@ -60,7 +60,8 @@ def check_one_report(options: argparse.Namespace) -> None:
     """
     if len(options.reports) > 1:
         raise ReportError(f"{len(options.reports)} files are given; name the file of their fixes by -o")
-    given = [f"--{name}" for name in ("column", "value", "window", "combine", "track") if getattr(options, name)]
+    names = ("column", "value", "window", "combine", "track", "with_reports")
+    given = [f"--{name.replace('_', '-')}" for name in names if getattr(options, name)]
     if given:
         raise ReportError(f"{given[0]} is for logs; name the file of their fixes by -o")
 

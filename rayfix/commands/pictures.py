@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from rayfix.commands.arguments import AddCommand, coordinate, seed_number
+from rayfix.commands.arguments import AddCommand, coordinate, positive, seed_number
+from rayfix.errors import ReportError
 from rayfix.extras import needs_extra
 
 _LAYERS = ("rays", "points", "mixture", "posterior", "fix")
@@ -15,6 +16,17 @@ def add_commands(add: AddCommand) -> None:
     view.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
     view.add_argument("report", type=Path, nargs="?", metavar="REPORT.json", help="a report, or {'reports': [...]}")
     view.add_argument("-o", "--output", type=Path, required=True, metavar="FIX.html", help="the page")
+    view.add_argument(
+        "--fixes", type=Path, metavar="FIXES.jsonl", help="fixes of a log, by 'rayfix locate -o', which the page plays"
+    )
+    view.add_argument("--truth", type=Path, metavar="TRUTH.csv", help="where the targets of these fixes really were")
+    view.add_argument(
+        "--longest-gap",
+        type=positive,
+        default=2.0,
+        metavar="S",
+        help="time between two points of the truth, up to which a target moved evenly, s (default: 2)",
+    )
 
     plot = add("plot", _plot, "draw a report in its scene: rays, points, mixtures, posterior and fix")
     plot.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
@@ -43,9 +55,19 @@ def _layers(text: str) -> tuple[str, ...]:
 def _view(options: argparse.Namespace) -> int:
     with needs_extra("service"):
         from rayfix.view import write_view
-    count = write_view(options.table, options.output, options.report)
+    recording = None
+    if options.fixes is not None:
+        with needs_extra("all"):
+            from rayfix.played import read_recording
+        recording = read_recording(options.fixes, options.truth, longest_gap=options.longest_gap)
+    elif options.truth is not None:
+        raise ReportError("--truth is for the fixes of a log; give them by --fixes")
+    view = write_view(options.table, options.output, options.report, recording=recording)
+    count = view.num_fixes
     fixes = "1 fix" if count == 1 else f"{count or 'no'} fixes"
     print(f"Wrote {options.output} with the site and {fixes}; open it in a browser")
+    if view.num_of_other_table:
+        print(f"{view.num_of_other_table} of them were made with another table than {options.table}")
     return 0
 
 

@@ -18,7 +18,7 @@ from rayfix_service.locator import Locator
 from rayfix_service.process_wide import collector_paused
 from rayfix_service.tracking.track import TrackedPosition
 from rayfix_service.tracking.tracker import Tracker
-from rayfix_service.wire import fix_to_document, parse_report
+from rayfix_service.wire import fix_to_document, parse_report, report_to_document
 from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import ReportError, TableError
 
@@ -42,6 +42,8 @@ class Task:
         For reports without a height, and instead of the reports' confidence.
     track : bool
         Whether targets are followed.
+    with_reports : bool
+        Whether JSON lines hold each fix's report as well.
     settings : FusionSettings
     """
 
@@ -52,6 +54,7 @@ class Task:
     height: Height | None = None
     confidence: float | None = None
     track: bool = False
+    with_reports: bool = False
     settings: FusionSettings = field(default_factory=FusionSettings)
 
 
@@ -108,7 +111,7 @@ class LogLocator:
             adapted = with_height(Adapted(report=report, sources=()), task.height)
             report = with_confidence(adapted, task.confidence).report
             fix, track = self._located(report, work.now)
-            document = self._document(entry.place, fix, track)
+            document = self._document(entry.place, report, fix, track)
         except ReportError as error:
             return Problem(place=entry.place, text=str(error))
         return Located(
@@ -132,7 +135,7 @@ class LogLocator:
             self._trackers[shard] = Tracker(self._locator.table, clock=lambda: self._now)
         return self._trackers[shard]
 
-    def _document(self, place: Place, fix: Fix, track: TrackedPosition | None) -> dict[str, Any]:
+    def _document(self, place: Place, report: Report, fix: Fix, track: TrackedPosition | None) -> dict[str, Any]:
         if self._task.output_format != "native":
             return write(fix, self._task.output_format, self._site, compute_seconds=0.0, track=track)
         document = fix_to_document(fix, 0.0, track)
@@ -142,6 +145,8 @@ class LogLocator:
             found = fix.regions.horizontal_radii(RADII)
             radii = {f"{p:g}": radius for p, radius in zip(RADII, found, strict=True)}
         document["horizontal_radii_m"] = radii
+        if self._task.with_reports:
+            document["report"] = report_to_document(report)
         return {"log": place.log, "entry": place.entry, **document}
 
 

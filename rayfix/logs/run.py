@@ -129,6 +129,8 @@ def _works(entries: Iterator[Entry | Problem], *, skip: int, track: bool) -> Ite
 def _check_output(output: Path, logs: Sequence[Path], task: Task) -> None:
     if task.output_format != "native" and task.layout != "jsonl":
         raise ReportError(f"--output {task.output_format} is written as JSON lines; let the name end in .jsonl")
+    if task.with_reports and (task.layout != "jsonl" or task.output_format != "native"):
+        raise ReportError("--with-reports is for fixes as JSON lines; let the name end in .jsonl, without --output")
     if not output.parent.is_dir():
         raise ReportError(f"there is no folder {output.parent}; make it first")
     if not output.exists():

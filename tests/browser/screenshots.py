@@ -20,6 +20,7 @@ from rayfix.example.hall import hall_scene, hall_stations
 from rayfix_evaluation.drops.simulate import simulate_report
 from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_offline.build import build_table
+from tests.support.messages.walks import write_walk
 from tests.support.running.server_process import start_rayfix_serve
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,14 +29,20 @@ HIDDEN = np.array([4.7, 6.2, 0.9])
 
 
 @pytest.fixture(scope="module")
-def url(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Address of a service of the hall's full table, that of the demo where it was run."""
+def full_table(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Path of the hall's full table, that of the demo where it was run."""
     table = ROOT / "demo" / "hall.h5"
     if not table.is_file():
         folder = tmp_path_factory.mktemp("hall")
         table = folder / "hall.h5"
         build_table(write_example(folder), table)
-    with start_rayfix_serve(table) as server:
+    return table
+
+
+@pytest.fixture(scope="module")
+def url(full_table: Path) -> Iterator[str]:
+    """Address of a service of that table."""
+    with start_rayfix_serve(full_table) as server:
         yield server.url
 
 
@@ -67,6 +74,17 @@ def test_screenshots_of_the_viewer(open_page: Callable[..., Any], url: str):
     page.keyboard.press("i")
     page.wait_for_selector(".components tbody tr")
     save(page, "viewer-table.png")
+
+
+def test_screenshot_of_a_log(open_page: Callable[..., Any], full_table: Path, tmp_path: Path):
+    log, truth, fixes, view = (tmp_path / name for name in ("log.jsonl", "truth.csv", "walk.jsonl", "walk.html"))
+    write_walk(log, truth, num_reports=25, seconds=0.2)
+    located = ["locate", str(full_table), str(log), "-o", str(fixes), "--track", "--with-reports", "--no-progress"]
+    assert main(located) == 0
+    assert main(["view", str(full_table), "--fixes", str(fixes), "--truth", str(truth), "-o", str(view)]) == 0
+    page = open_page(view.as_uri())
+    page.locator("#player input").fill("700")
+    save(page, "viewer-log.png")
 
 
 def test_picture_for_a_paper(url: str, tmp_path: Path):

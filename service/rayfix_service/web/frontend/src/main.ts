@@ -8,6 +8,7 @@ import "./style/screens.css";
 
 import { Api, ServiceError } from "./api";
 import { decodeBase64, embeddedData } from "./embedded";
+import { recordingOf } from "./recording";
 import { readGlb } from "./scene/glb";
 import { Stage } from "./scene/stage";
 import type { Mesh, Site, TableInfo } from "./types";
@@ -73,6 +74,7 @@ async function start(): Promise<void> {
     const viewer = new Viewer(layout, stage, embedded, readGlb(decodeBase64(embedded.scene_base64)), null);
     viewer.streamState("file");
     for (const event of embedded.events) viewer.store.add(event);
+    if (embedded.recording) viewer.play(recordingOf(embedded.recording.name, embedded.recording.events));
     window.rayfixViewer = viewer;
     status.done();
     return;
@@ -85,7 +87,7 @@ async function start(): Promise<void> {
   status.done();
   performance.mark("rayfix-ready");
   void api.listen(
-    (event) => viewer.store.add(event),
+    (event) => viewer.receive(event),
     (state) => viewer.streamState(state),
   );
 }

@@ -9,6 +9,8 @@ export interface Target {
   latest: FixEvent;
   /** Positions, the latest last, m. */
   trail: Vec3[];
+  /** True positions where they are known, the latest last, m. */
+  truths: Vec3[];
   /** Where the service follows the target. */
   track: TrackHistory | null;
   count: number;
@@ -26,10 +28,11 @@ export class Store {
   selected: Target | null = null;
   paused = false;
   total = 0;
-  private readonly fixListeners: ((target: Target) => void)[] = [];
+  private readonly fixListeners: ((target: Target | null) => void)[] = [];
   private readonly selectListeners: (() => void)[] = [];
 
-  onFix(listener: (target: Target) => void): void {
+  /** Listen to fixes; given the target, or null when all of them have changed. */
+  onFix(listener: (target: Target | null) => void): void {
     this.fixListeners.push(listener);
   }
 
@@ -41,25 +44,44 @@ export class Store {
   add(event: FixEvent): void {
     const live = event.source === "stream";
     if (live && this.paused) return;
+    const target = this.take(event);
+    if (target === null) return;
+    for (const listener of this.fixListeners) listener(target);
+    if (!(live || event.source === "log") || this.selected === null) this.select(target.id);
+  }
+
+  /** Show these fixes, ascending by time, instead of all others; the selected target stays selected. */
+  replay(events: readonly FixEvent[]): void {
+    const selected = this.selected?.id ?? null;
+    this.targets.clear();
+    for (const event of events) this.take(event);
+    for (const listener of this.fixListeners) listener(null);
+    this.select(selected);
+  }
+
+  /** Take a fix in without a word; null for one that is there already. */
+  private take(event: FixEvent): Target | null {
+    const live = event.source === "stream";
     const id = event.fix.target_id ?? UNNAMED;
     this.total += 1;
     let target = this.targets.get(id);
     if (target === undefined) {
       if (this.targets.size >= MOST_TARGETS) this.forgetOldest();
-      target = { id, latest: event, trail: [], track: null, count: 0, seen: 0 };
+      target = { id, latest: event, trail: [], truths: [], track: null, count: 0, seen: 0 };
       this.targets.set(id, target);
     }
     // A posted report comes back over the stream, too; it is one fix.
     const again = live && sameReport(target.latest, event) && target.count > 0;
-    if (again) return;
+    if (again) return null;
     target.latest = event;
     target.count += 1;
     target.seen = performance.now();
     if (event.fix.position !== null) target.trail.push(vec(event.fix.position));
     if (target.trail.length > TRAIL) target.trail.shift();
     if (event.fix.track) target.track = followTrack(target.track, event.fix.track, TRAIL);
-    for (const listener of this.fixListeners) listener(target);
-    if (!live || this.selected === null) this.select(id);
+    if (event.truth) target.truths.push(event.truth);
+    if (target.truths.length > TRAIL) target.truths.shift();
+    return target;
   }
 
   select(id: string | null): void {
@@ -87,7 +109,7 @@ export class Store {
   clear(): void {
     this.targets.clear();
     this.select(null);
-    for (const listener of this.fixListeners) listener(null as never);
+    for (const listener of this.fixListeners) listener(null);
   }
 
   private forgetOldest(): void {

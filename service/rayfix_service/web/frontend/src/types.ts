@@ -98,7 +98,8 @@ export interface Fix {
   /** Where the service follows the target. */
   track?: Track | null;
   table_id: string;
-  compute_ms: number;
+  /** Absent in the fixes of a log. */
+  compute_ms?: number;
 }
 
 export interface Posterior {
@@ -112,8 +113,8 @@ export interface Posterior {
 export interface FixEvent {
   report: Report;
   fix: Fix;
-  source: "stream" | "posted" | "simulated" | "file";
-  /** Where a simulated UE was. */
+  source: "stream" | "posted" | "simulated" | "file" | "log";
+  /** Where a simulated or surveyed UE was. */
   truth?: Vec3;
   posterior?: Posterior;
 }
@@ -155,6 +156,8 @@ export interface EmbeddedData {
   settings: ViewerSettings;
   scene_base64: string;
   events: FixEvent[];
+  /** Fixes of a log, to be played. */
+  recording?: { name: string; events: FixEvent[] };
 }
 
 /** What the viewer knows of the site once it is loaded. */

@@ -15,6 +15,7 @@ import { Targets } from "./scene/targets";
 import { postingOf } from "./messages";
 import { Store } from "./store";
 import { theme } from "./theme";
+import { isFixes, readFixes, type Recording } from "./recording";
 import { Mirrors } from "./trace/mirrors";
 import type { FixEvent, Mesh, Point, Site, TableInfo, Vec3 } from "./types";
 import { Dialogs } from "./ui/dialogs";
@@ -23,6 +24,7 @@ import { Inspector } from "./ui/inspector";
 import { installKeys } from "./ui/keyboard";
 import type { Layout, Mode } from "./ui/layout";
 import { drawLegend } from "./ui/legend";
+import { Player } from "./ui/player";
 import { Rulers } from "./ui/rulers";
 import { Simulator } from "./ui/simulator";
 import { Notices } from "./ui/status";
@@ -51,6 +53,7 @@ export class Viewer {
   private readonly viewPanel: ViewPanel;
   private readonly fixPanel: FixPanel;
   private readonly simulator = new Simulator();
+  private readonly player = new Player(this.store, () => this.playerChanged());
   private readonly dialogs: Dialogs;
   private readonly notices: Notices;
   private readonly ground: number;
@@ -106,6 +109,7 @@ export class Viewer {
 
     const rulers = new Rulers(stage, layout.canvas, () => layout.insets(), site.table.site.north_deg);
     layout.labels.before(rulers.element);
+    layout.legend.before(this.player.element);
 
     layout.docs.hidden = api === null;
     layout.buttons.simulate.hidden = !site.settings.simulation;
@@ -123,7 +127,7 @@ export class Viewer {
       section: () => this.viewPanel.toggleSection(),
       step: (by) => this.store.step(by),
       focus: () => this.focus(this.store.selected?.latest.fix.position ?? null),
-      pause: () => list.togglePause(),
+      pause: () => (this.player.active ? this.player.toggle() : list.togglePause()),
       simulate: () => site.settings.simulation && this.simulate(!this.simulating),
       paste: () => this.paste(),
       mode: (mode) => (mode === "fixes" || api !== null) && this.show(mode),
@@ -136,7 +140,7 @@ export class Viewer {
     this.listenToDrops();
 
     this.store.onFix((target) => {
-      this.stale ||= target === this.store.selected;
+      this.stale ||= target === null || target === this.store.selected;
       if (this.stale) stage.invalidateLater();
     });
     this.store.onSelect(() => this.refresh());
@@ -152,6 +156,22 @@ export class Viewer {
     const { connection } = this.layout;
     connection.className = state;
     connection.textContent = state === "file" ? "a file" : STREAM_TEXT[state];
+  }
+
+  /** Take in a fix of the stream, unless a log is shown. */
+  receive(event: FixEvent): void {
+    if (!this.player.active) this.store.add(event);
+  }
+
+  /** Show the fixes of a log, to be played. */
+  play(recording: Recording): void {
+    this.show("fixes");
+    this.player.open(recording);
+  }
+
+  private playerChanged(): void {
+    this.layout.stage.classList.toggle("playing", this.player.active);
+    this.inset();
   }
 
   /** Let a person choose among the tables of the service, where there are several. */
@@ -217,9 +237,10 @@ export class Viewer {
   }
 
   private async loadPosterior(event: FixEvent): Promise<void> {
-    const live = event.source === "stream";
+    const live = event.source === "stream" || event.source === "log";
     const now = performance.now();
     if (this.api === null || event.fix.position === null || this.posteriorOf === event) return;
+    if (event.report.measurements.length === 0) return;
     if (live && now - this.posteriorAt < LEAST_BETWEEN) return;
     this.posteriorOf = event;
     this.posteriorAt = now;
@@ -260,7 +281,14 @@ export class Viewer {
   }
 
   private paste(): void {
-    if (this.api !== null) this.dialogs.paste((text) => this.locate(text));
+    if (this.api !== null) this.dialogs.paste((text) => this.take(text, "pasted fixes"));
+  }
+
+  /** Play the fixes of a log; locate anything else. */
+  private async take(text: string, name: string): Promise<void> {
+    if (isFixes(text)) this.play(readFixes(name, text));
+    else if (this.api !== null) await this.locate(text);
+    else throw new Error("This page has no service that locates reports; it plays fixes as rayfix locate -o writes them.");
   }
 
   /** Locate a report, a batch or another system's message given as text. */
@@ -333,21 +361,22 @@ export class Viewer {
 
   private listenToDrops(): void {
     const { stage } = this.layout;
-    const over = (on: boolean): void => void stage.classList.toggle("dropping", on && this.api !== null);
+    const over = (on: boolean): void => void stage.classList.toggle("dropping", on);
     stage.addEventListener("dragover", (e) => (e.preventDefault(), over(true)));
     stage.addEventListener("dragleave", () => over(false));
     stage.addEventListener("drop", (e) => {
       e.preventDefault();
       over(false);
-      if (this.api !== null) void this.locateDropped(e.dataTransfer);
+      void this.takeDropped(e.dataTransfer);
     });
   }
 
-  private async locateDropped(data: DataTransfer | null): Promise<void> {
-    const text = (await data?.files[0]?.text()) ?? data?.getData("text");
+  private async takeDropped(data: DataTransfer | null): Promise<void> {
+    const file = data?.files[0];
+    const text = (await file?.text()) ?? data?.getData("text");
     if (!text) return;
     try {
-      await this.locate(text);
+      await this.take(text, file?.name ?? "dropped fixes");
     } catch (error) {
       this.notices.show((error as Error).message, "error");
     }

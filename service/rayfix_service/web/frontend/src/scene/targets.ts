@@ -16,6 +16,7 @@ interface Drawn {
   fixes: Trail;
   state: Label;
   track: Trail;
+  truth: Trail;
 }
 
 export class Targets {
@@ -64,6 +65,7 @@ export class Targets {
       const drawn = this.drawn.get(target.id) ?? this.make(target);
       this.drawFix(drawn, target, dots);
       this.drawTrack(drawn, target, dots, regions);
+      this.drawTruth(drawn, target, dots);
     }
     for (const [id, drawn] of this.drawn) if (!this.store.targets.has(id)) this.forget(id, drawn);
     this.dots.set(dots);
@@ -100,6 +102,14 @@ export class Targets {
     regions.push({ mean: at, covariance, sigmas: SIGMAS, colour: palette.track, opacity, throughWalls: true });
   }
 
+  private drawTruth(drawn: Drawn, target: Target, dots: Dot[]): void {
+    const { palette } = theme;
+    const points = this.shown.fixes ? target.truths.map((p) => this.stage.local(p)) : [];
+    drawn.truth.draw(this.shown.trails ? points : [], palette.truth, this.store.selected === target ? 0.9 : 0.4);
+    const at = points.at(-1);
+    if (at !== undefined && target.latest.truth) dots.push({ position: at, colour: palette.truth, diameter: 9 });
+  }
+
   private localTrack(target: Target): Vector3[] {
     return (target.track?.trail ?? []).map((p) => this.stage.local(p));
   }
@@ -111,8 +121,9 @@ export class Targets {
       fixes: new Trail(TRAIL),
       state: labels.add("", "track", new Vector3()),
       track: new Trail(TRAIL),
+      truth: new Trail(TRAIL),
     };
-    this.group.add(drawn.fixes, drawn.track);
+    this.group.add(drawn.fixes, drawn.track, drawn.truth);
     drawn.name.element.addEventListener("click", () => this.store.select(target.id));
     this.drawn.set(target.id, drawn);
     return drawn;
@@ -120,7 +131,7 @@ export class Targets {
 
   private forget(id: string, drawn: Drawn): void {
     for (const label of [drawn.name, drawn.state]) this.stage.labels.remove(label);
-    for (const trail of [drawn.fixes, drawn.track]) {
+    for (const trail of [drawn.fixes, drawn.track, drawn.truth]) {
       this.group.remove(trail);
       trail.dispose();
     }

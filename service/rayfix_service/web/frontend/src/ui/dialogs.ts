@@ -16,7 +16,7 @@ const KEYS: readonly (readonly [string, string])[] = [
   ["X", "section"],
   ["J K", "next and previous target"],
   ["Enter", "look at the selected fix"],
-  ["Space", "hold the stream, go on"],
+  ["Space", "hold the stream, go on; play or halt a log"],
   ["S", "simulate: click a place"],
   ["V", "paste a report"],
   ["F I", "fixes, table inspector"],
@@ -63,7 +63,7 @@ export class Dialogs {
       },
       h("h2", {}, "A report"),
       h("p", { className: "muted" }, "Paste a report as POST /v1/positions takes it, a batch, an NRPPa message, angles of Silicon Labs locators or lines " +
-          "of u-blox anchors; or drop a file anywhere."),
+          "of u-blox anchors; or drop a file anywhere. Fixes of a log, as rayfix locate -o writes them, are played."),
       text,
       problem,
       h("div", { className: "actions" }, h("button", { type: "button", onclick: () => this.dialog.close() }, "Cancel"), submit),

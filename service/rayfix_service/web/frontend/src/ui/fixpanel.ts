@@ -17,7 +17,7 @@ const MEANING = {
   insufficient: "too little for a position",
 } as const;
 
-const SOURCES = { stream: "live", posted: "posted here", simulated: "simulated", file: "from the file" } as const;
+const SOURCES = { stream: "live", posted: "posted here", simulated: "simulated", file: "from the file", log: "from the log" } as const;
 
 const KINDS: Record<string, string> = { aoa: "angle", pt: "range", toa: "arrival", tdoa: "difference", rssi: "strength" };
 
@@ -60,7 +60,9 @@ export class FixPanel {
       fix.warnings?.length ? h("ul", { className: "warnings" }, ...fix.warnings.map((text) => h("li", {}, text))) : null,
       track !== null && trackBlock(track.latest, fix.confidence, this.onFocus),
       isTrusted(fix) && fix.candidates.length > 1 && this.rivals(event),
-      this.measurements(explained),
+      event.source === "log" && fix.measurements.length > event.report.measurements.length
+        ? h("p", { className: "muted" }, "These fixes are without their reports; rayfix locate --with-reports writes both.")
+        : this.measurements(explained),
     );
   }
 
@@ -81,7 +83,8 @@ export class FixPanel {
         isTrusted(fix) &&
           fact("vertical", `± ${deviation(fix.vertical_accuracy_m!)} m`, `with a probability of ${percent(fix.confidence)}`),
         isTrusted(fix) && fact("held with", percent(fix.confidence), "probability that the target is within the accuracies"),
-        error === undefined ? fact("computed in", `${fix.compute_ms.toFixed(1)} ms`) : fact("true error", `${error.toFixed(2)} m`),
+        fix.compute_ms !== undefined && error === undefined && fact("computed in", `${fix.compute_ms.toFixed(1)} ms`),
+        error !== undefined && fact("true error", `${error.toFixed(2)} m`),
       ),
     );
   }

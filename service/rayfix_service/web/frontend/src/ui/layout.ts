@@ -23,6 +23,7 @@ export interface Layout {
   onInsets(listener: () => void): void;
 }
 
+const PLAYER = 60; // px that the bar of a log takes
 const NARROW = "(max-width: 1023px)";
 
 export function buildLayout(root: HTMLElement): Layout {
@@ -115,7 +116,7 @@ export function buildLayout(root: HTMLElement): Layout {
       left: left.classList.contains("open") ? left.offsetWidth : 0,
       right: right.classList.contains("open") ? right.offsetWidth : 0,
       top: bar.offsetHeight,
-      bottom: legend.offsetHeight + 8,
+      bottom: legend.offsetHeight + (stage.classList.contains("playing") ? PLAYER : 8),
     }),
     onInsets: (listener) => listeners.push(listener),
   };
