@@ -54,11 +54,11 @@ def _layers(text: str) -> tuple[str, ...]:
 
 def _view(options: argparse.Namespace) -> int:
     with needs_extra("service"):
-        from rayfix.view import write_view
+        from rayfix.viewing.page import write_view
     recording = None
     if options.fixes is not None:
         with needs_extra("all"):
-            from rayfix.played import read_recording
+            from rayfix.viewing.recording import read_recording
         recording = read_recording(options.fixes, options.truth, longest_gap=options.longest_gap)
     elif options.truth is not None:
         raise ReportError("--truth is for the fixes of a log; give them by --fixes")
@@ -73,7 +73,7 @@ def _view(options: argparse.Namespace) -> int:
 
 def _plot(options: argparse.Namespace) -> int:
     with needs_extra("all"):
-        from rayfix.view import read_reports
+        from rayfix.viewing.page import read_reports
         from rayfix_evaluation.pictures.files import check_picture
         from rayfix_evaluation.pictures.report_plot import plot_report
         from rayfix_service.locator import Locator

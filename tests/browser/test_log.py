@@ -26,7 +26,7 @@ DROP = """text => {
 
 @pytest.fixture(scope="module")
 def walk(hall_table_path: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Fixes of a walk with their reports, and the page that plays them beside the truth."""
+    """Write fixes of a walk with their reports, and the page that plays them beside the truth."""
     folder = tmp_path_factory.mktemp("walk")
     log, truth, fixes, page = (folder / name for name in ("log.jsonl", "truth.csv", "fixes.jsonl", "walk.html"))
     write_walk(log, truth, num_reports=COUNT)

@@ -7,7 +7,7 @@ import pytest
 
 from rayfix.cli import main
 from rayfix.errors import ViewError
-from rayfix.played import MOST_FIXES, read_recording
+from rayfix.viewing.recording import MOST_FIXES, read_recording
 from rayfix_tables.errors import ReportError
 from tests.support.messages.reports import REPORT
 

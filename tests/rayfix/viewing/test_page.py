@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from rayfix.cli import main
-from rayfix.view import ViewError, inline, read_reports
+from rayfix.viewing.page import ViewError, inline, read_reports
 from rayfix_service.web.assets import load_assets
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table

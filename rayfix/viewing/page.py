@@ -53,7 +53,7 @@ def write_view(
     report_path : pathlib.Path, optional
         A report in the form of ``POST /v1/positions``, or several in ``{"reports": [...]}``.
     recording : mapping, optional
-        Fixes of a log, which the page plays; see :func:`rayfix.played.read_recording`.
+        Fixes of a log, which the page plays; see :func:`rayfix.viewing.recording.read_recording`.
 
     Returns
     -------

@@ -42,7 +42,7 @@ def read_recording(path: Path, truth_path: Path | None = None, *, longest_gap: f
         When the file holds no fixes, or too many, or none has a true position.
     """
     truth = None if truth_path is None else read_truth(truth_path, longest_gap=longest_gap)
-    events = []
+    events: list[dict[str, Any]] = []
     for fix in _fixes(path):
         if len(events) == MOST_FIXES:
             raise ViewError(

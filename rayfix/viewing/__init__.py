@@ -1,0 +1,1 @@
+"""Pages that show a site and its fixes without a service."""
