@@ -12,7 +12,7 @@ PINNED := PIP_CONSTRAINT=$(CURDIR)/constraints.txt PIP_BUILD_CONSTRAINT=$(CURDIR
 $(VENV)/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
-	$(PINNED) $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,ifc]' --group dev
+	$(PINNED) $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,ifc,parquet]' --group dev
 	touch $@
 
 # The viewer's files, which the service gives at / and packages hold. Where they cannot be built, the service does without.
