@@ -23,6 +23,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 NUMERICAL = ("tests/tables", "tests/offline", "tests/service/fusion", "tests/service/tracking", "tests/evaluation")
 
+# Where threads share the work, or libraries do that have kernels of their own for several.
+OF_THREADS = ("tests/offline/fit", "tests/offline/rays", "tests/service/fusion", "tests/service/tracking")
+
 # By the architecture, OpenBLAS's names of two older cores.
 CORES = {"x86_64": ("Nehalem", "Sandybridge"), "aarch64": ("ARMV8", "CORTEXA57")}
 
@@ -46,6 +49,7 @@ class Processor:
 
     core: str | None
     threads: int
+    tests: tuple[str, ...]
 
     def environment(self, cache: str) -> dict[str, str]:
         """Environment that makes the libraries take them."""
@@ -61,16 +65,16 @@ class Processor:
 
 
 def processors() -> list[Processor]:
-    """One thread with the oldest core, two with the other."""
-    cores = CORES.get(platform.machine(), (None, None))
-    return [Processor(core=core, threads=threads) for core, threads in zip(cores, (1, 2), strict=True)]
+    """All numerical tests on one thread of the oldest core; those of threads on two of the other."""
+    oldest, other = CORES.get(platform.machine(), (None, None))
+    return [Processor(core=oldest, threads=1, tests=NUMERICAL), Processor(core=other, threads=2, tests=OF_THREADS)]
 
 
 def refuse_unless_taken(processor: Processor, environment: dict[str, str]) -> None:
     """End when a library has kept the kernels of the processor that is here."""
     done = subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True, text=True, check=True)
     found = json.loads(done.stdout)
-    print(f"== {processor}: {found}", flush=True)
+    print(f"== {processor.core}, {processor.threads} threads: {found}", flush=True)
     wanted = [] if processor.core is None else [processor.core.lower()]
     if wanted and [core.lower() for core in found["cores"]] != wanted:
         sys.exit(f"OpenBLAS runs as {found['cores']}, not as {processor.core}")
@@ -82,12 +86,12 @@ def refuse_unless_taken(processor: Processor, environment: dict[str, str]) -> No
 
 def main(arguments: list[str]) -> int:
     """Run the tests once for each processor; 1 when any of them fails."""
-    chosen = arguments or ["--numprocesses", "auto", "--dist", "loadfile", *NUMERICAL]
     status = 0
     with tempfile.TemporaryDirectory(prefix="rayfix-portable-") as cache:
         for processor in processors():
             environment = processor.environment(cache)
             refuse_unless_taken(processor, environment)
+            chosen = arguments or ["--numprocesses", "auto", "--dist", "loadfile", *processor.tests]
             command = [sys.executable, "-m", "pytest", "-q", "-m", "not slow", *chosen]
             status |= subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode != 0
     return status

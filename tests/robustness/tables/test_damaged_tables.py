@@ -71,10 +71,6 @@ def check_flips(table: Path, *, seed: int, count: int) -> None:
     assert 0.2 * count < sum(not outcome.accepted for outcome in outcomes) < 0.95 * count
 
 
-def test_flipped_bits_are_found_or_change_nothing(table_path: Path) -> None:
-    check_flips(table_path, seed=1, count=300)
-
-
 def test_flipped_bits_of_a_former_table_are_found_or_change_nothing(former_table_path: Path) -> None:
     check_flips(former_table_path, seed=1, count=200)
 
@@ -89,9 +85,8 @@ def test_no_flipped_bit_keeps_hdf5_busy(table_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2, 7))
-def test_a_thousand_flipped_bits_are_found_or_change_nothing(table_path: Path, seed: int) -> None:
-    check_flips(table_path, seed=seed, count=1000)
+def test_a_thousand_flipped_bits_are_found_or_change_nothing(table_path: Path) -> None:
+    check_flips(table_path, seed=2, count=1000)  # benchmarks/robustness/flips.py flips more, of any seed
 
 
 @pytest.mark.parametrize(("place", "bit"), HANGS)
