@@ -170,7 +170,8 @@ def test_a_message_is_pasted_and_an_inconsistent_fix_has_no_probabilities(open_p
     page.wait_for_selector("h2:has-text('6C1DEBA5F60C')")
     assert "held with" in page.locator(".fix").inner_text()
     # A service with other slow work under way does not look for turns, and the picture of this fix is such work.
-    page.wait_for_function("rayfixViewer.store.selected.latest.posterior !== undefined")
+    while not page.evaluate("rayfixViewer.store.selected.latest.posterior !== undefined"):
+        page.wait_for_timeout(100)
     seen = {"bs1": (-10.5, 96.5, 7.97), "bs2": (63.0, 102.7, 4.1), "bs3": (-133.7, 93.7, 13.96)}
     measurements: list[dict[str, Any]] = []
     for name, (azimuth, zenith, length) in seen.items():
