@@ -14,6 +14,7 @@ import tomli_w
 from rayfix.logs.entries import Problem
 from rayfix.logs.reading import Reading, ReadState, read_logs
 from rayfix_evaluation.calibration.evidence import Evidence, compare_evidence
+from rayfix_evaluation.calibration.held_out import HeldOut, judge, only
 from rayfix_evaluation.calibration.measured import KnownReport
 from rayfix_evaluation.calibration.pictures import draw_errors
 from rayfix_evaluation.calibration.site import SiteCalibration, calibrate_site
@@ -45,6 +46,8 @@ class CalibratedSite:
     calibration : SiteCalibration
     evidence : Evidence
         Of reports, before and after.
+    held_out : HeldOut or None
+        Which part of the calibration was taken, and why; None without the truth.
     num_reports, num_problems, num_elsewhere : int
         Reports that were used; entries that are none; reports whose true position is not known.
     document : dict
@@ -54,6 +57,7 @@ class CalibratedSite:
     path: Path
     calibration: SiteCalibration
     evidence: Evidence
+    held_out: HeldOut | None
     num_reports: int
     num_problems: int
     num_elsewhere: int
@@ -100,11 +104,15 @@ def calibrate_logs(
         raise ReportError(f"there is no folder {output.parent}; make it first")
     truth = None if truth_path is None else read_truth(truth_path, longest_gap=longest_gap)
     progress("reading", 0, 0)
+    held_out = None
     known, unknown, num_problems, num_elsewhere = _reports(logs, reading, truth, height)
     if truth is not None:
         if not known:
             raise ReportError(f"no report is of a time that {truth_path} has a position for; check the times of both")
-        calibration = calibrate_site(known, table.site, solver_of(table), progress=progress)
+        solver = solver_of(table)
+        calibration = calibrate_site(known, table.site, solver, progress=progress)
+        held_out = judge(known, table, solver, calibration, progress=progress)
+        calibration = only(held_out.part, calibration, table.site)
     else:
         if not unknown:
             raise ReportError("the logs hold no report that can be used; check them by rayfix locate")
@@ -118,11 +126,12 @@ def calibrate_logs(
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
         draw_errors(calibration, pictures)
-    summary = _summary(calibration, evidence, len(used), num_problems, num_elsewhere)
+    summary = _summary(calibration, evidence, held_out, len(used), num_problems, num_elsewhere)
     return CalibratedSite(
         path=output,
         calibration=calibration,
         evidence=evidence,
+        held_out=held_out,
         num_reports=len(used),
         num_problems=num_problems,
         num_elsewhere=num_elsewhere,
@@ -183,7 +192,12 @@ def _write(path: Path, text: str) -> None:
 
 
 def _summary(
-    calibration: SiteCalibration, evidence: Evidence, num_reports: int, num_problems: int, num_elsewhere: int
+    calibration: SiteCalibration,
+    evidence: Evidence,
+    held_out: HeldOut | None,
+    num_reports: int,
+    num_problems: int,
+    num_elsewhere: int,
 ) -> dict[str, Any]:
     stations = {}
     for name, found in calibration.stations.items():
@@ -227,6 +241,9 @@ def _summary(
         "problems": num_problems,
         "reports_of_unknown_positions": num_elsewhere,
         "log_evidence_per_report": {"before": evidence.before, "after": evidence.after, "reports": evidence.count},
+        "held_out": None
+        if held_out is None
+        else {"taken": held_out.part, "reports": held_out.count, "log_evidence_per_report": dict(held_out.evidence)},
         "stations": stations,
     }
 
@@ -260,12 +277,31 @@ def calibration_lines(found: CalibratedSite) -> list[str]:
     lines.append(
         f"log evidence of a report: {evidence.before:.2f} before, {evidence.after:.2f} after ({evidence.count} reports)"
     )
+    if found.held_out is not None:
+        lines.append(_taken(found.held_out))
     if found.num_elsewhere:
         lines.append(f"{found.num_elsewhere} reports are of times without a true position")
     if found.num_problems:
         lines.append(f"{found.num_problems} entries are no reports; 'rayfix locate' lists them")
     lines.append(f"{found.path} is written; 'rayfix build {found.path} -o T.h5' puts it into the table in seconds")
     return lines
+
+
+def _taken(held_out: HeldOut) -> str:
+    """Say which part of a calibration was taken, and by what evidence."""
+    names = {
+        "all": "all of it is taken",
+        "systematic": "biases and turns alone are taken, deviations stay as reports state them",
+        "deviations": "deviations alone are taken, biases and turns stay as they were",
+        "nothing": "none of it is taken: the site as it is explains such reports best",
+    }
+    evidence = held_out.evidence
+    by = f"of {held_out.count} held-out reports" if held_out.count else "of the same reports, for want of places"
+    return (
+        f"{names[held_out.part]}; log evidence {by}: {evidence['nothing']:.2f} before, "
+        f"{evidence['systematic']:.2f} with biases and turns, {evidence['deviations']:.2f} with deviations, "
+        f"{evidence['all']:.2f} with both"
+    )
 
 
 def _tails(share: float, scale: float) -> str:

@@ -176,6 +176,8 @@ def _condition(samples: Samples, scales: Hyperparameters) -> Process:
 
 def _smooth(one: Array, other: Array, scales: Hyperparameters) -> Array:
     """Covariance of the smooth part between directions."""
+    if scales.amplitude == 0.0:
+        return np.zeros((len(one), len(other)))
     # The chord and not the arc: of arcs around the circle this would be no covariance.
     chord = np.rad2deg(2.0 * np.sin(0.5 * np.deg2rad(one[:, None, 0] - other[None, :, 0])))
     azimuth = chord / scales.azimuth_scale

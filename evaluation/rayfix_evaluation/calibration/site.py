@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 
 from rayfix_evaluation.calibration.measured import KnownReport, StationErrors, errors_of
-from rayfix_evaluation.calibration.ranges import calibrate_ranges
+from rayfix_evaluation.calibration.ranges import calibrate_ranges, with_common_tails
 from rayfix_evaluation.calibration.spread import Spread
 from rayfix_evaluation.calibration.station import (
     AngleCalibration,
@@ -104,7 +104,7 @@ def calibrate_site(
         assert measured is not None
         ranges[station_id] = calibrate_ranges(measured)
     progress("ranges", 1, 1)
-    angles, ranges = _pooled(angles), _pooled(ranges)
+    angles, ranges = _pooled(angles), _pooled(with_common_tails(ranges))
     calibrated = {
         station_id: _station(each, angles.get(station_id), ranges.get(station_id))
         for station_id, each in errors.items()

@@ -48,7 +48,9 @@ def log_density(errors: Array, spread: Spread, volume: float, extra: Array | Non
     return np.asarray(np.logaddexp.reduce(_parts(errors, spread, volume, extra), axis=0))
 
 
-def fit_spread(errors: Array, volume: float, weights: Array | None = None) -> Spread:
+def fit_spread(
+    errors: Array, volume: float, weights: Array | None = None, *, tails: tuple[float, float] | None = None
+) -> Spread:
     """Fit the spread by expectation-maximisation.
 
     Tails are kept where the evidence pays for two more numbers, by the Bayesian information criterion.
@@ -59,9 +61,15 @@ def fit_spread(errors: Array, volume: float, weights: Array | None = None) -> Sp
         Without their systematic parts.
     volume : float
     weights : ndarray of shape (n,), optional
+        What each is worth in independent errors.
+    tails : tuple of float, optional
+        Their share and scale where they are known; the deviation alone is fitted then.
     """
     w = np.ones(len(errors)) if weights is None else weights
     scale = 1.4826 * np.maximum(_median(np.abs(errors), w), 1e-9)
+    if tails is not None:
+        start = Spread(stdev=tuple(scale.tolist()), tail_share=tails[0], tail_scale=tails[1], outlier_share=0.02)
+        return _maximised(errors, start, volume, w, tails_known=True)
     narrow = Spread(stdev=tuple(scale.tolist()), tail_share=0.0, tail_scale=1.0, outlier_share=0.02)
     wide = Spread(stdev=tuple(scale.tolist()), tail_share=0.15, tail_scale=3.0, outlier_share=0.01)
     found = [_maximised(errors, start, volume, w) for start in (narrow, wide)]
@@ -70,8 +78,8 @@ def fit_spread(errors: Array, volume: float, weights: Array | None = None) -> Sp
     return found[1] if useful else found[0]
 
 
-def _maximised(errors: Array, spread: Spread, volume: float, w: Array) -> Spread:
-    tails = spread.tail_share > 0.0
+def _maximised(errors: Array, spread: Spread, volume: float, w: Array, *, tails_known: bool = False) -> Spread:
+    tails = spread.tail_share > 0.0 and not tails_known
     for _ in range(_ROUNDS):
         parts = _parts(errors, spread, volume, None)
         share = np.exp(parts - np.logaddexp.reduce(parts, axis=0)) * w
@@ -85,7 +93,7 @@ def _maximised(errors: Array, spread: Spread, volume: float, w: Array) -> Spread
             scale = float(np.clip(np.sqrt(share[1] @ squares / total[1]), 1.5, 20.0))
         new = Spread(
             stdev=tuple(stdev.tolist()),
-            tail_share=float(total[1] / max(total[0] + total[1], 1e-12)) if tails else 0.0,
+            tail_share=float(total[1] / max(total[0] + total[1], 1e-12)) if tails else spread.tail_share,
             tail_scale=scale,
             outlier_share=float(np.clip(total[2] / total.sum(), 1e-4, 0.5)),
         )

@@ -24,7 +24,7 @@ __all__ = [
     "calibrate_angles",
     "calibrated_station",
     "chosen_models",
-    "num_independent",
+    "independent_shares",
     "num_places",
     "try_angles",
 ]
@@ -108,9 +108,17 @@ class AngleCalibration:
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RangeCalibration:
-    """What was found of a station's ranges, m; as :class:`AngleCalibration`."""
+    """What was found of a station's ranges, m; as :class:`AngleCalibration`.
+
+    Attributes
+    ----------
+    residual : ndarray of shape (n,), m
+        Errors less the bias, each held out; none without the truth.
+    weights : ndarray of shape (n,)
+        What each is worth in independent ones.
+    """
 
     model: Model
     evidence: dict[Model, float]
@@ -120,6 +128,8 @@ class RangeCalibration:
     bias_stdev: float
     correlation_time: float | None
     correlated_share: float | None
+    residual: Array = field(default_factory=lambda: np.zeros(0))
+    weights: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,17 +213,24 @@ def chosen_models(trials: Sequence[AngleTrial]) -> list[Model]:
     return found
 
 
-def final_spread(trial: AngleTrial, model: Model) -> Spread:
+def final_spread(trial: AngleTrial, model: Model, weights: Array) -> Spread:
     """Spread of the errors that a model leaves over; how well its prediction is known is no part of it."""
     residual, known = trial.residual[model], trial.known[model]
-    first = fit_spread(residual, _volume(residual))
-    return fit_spread(residual / np.sqrt(1.0 + np.square(known / first.stdev)), _volume(residual))
+    first = fit_spread(residual, _volume(residual), weights)
+    return fit_spread(residual / np.sqrt(1.0 + np.square(known / first.stdev)), _volume(residual), weights)
 
 
-def num_independent(seconds: Array, place: NDArray[np.int64], share: float) -> float:
-    """Count the independent errors that correlated ones are worth: at a place, the correlated part counts once."""
-    _, count = np.unique(place, return_counts=True)
-    return float((count / (1.0 + share * (count - 1))).sum())
+def independent_shares(place: NDArray[np.int64], share: float) -> Array:
+    """Return what each measurement is worth in independent ones, shape (n,): at a place the correlated part counts once.
+
+    Parameters
+    ----------
+    place : ndarray of int of shape (n,)
+    share : float
+        Of the variance that is correlated.
+    """
+    _, inverse, count = np.unique(place, return_inverse=True, return_counts=True)
+    return np.asarray(1.0 / (1.0 + share * (count[inverse] - 1.0)))
 
 
 def calibrate_angles(trial: AngleTrial, model: Model) -> AngleCalibration:
@@ -222,13 +239,14 @@ def calibrate_angles(trial: AngleTrial, model: Model) -> AngleCalibration:
     processes = _fit(errors, model)
     azimuth = processes[0].scales
     share = azimuth.correlated**2 / (azimuth.correlated**2 + azimuth.white**2)
+    weights = independent_shares(errors.place, float(share))
     turn, turn_stdev, constant, constant_stdev, notes = _constants(errors, processes, model)
     ranges = [(float(column.min()), float(column.max())) for column in errors.true.T]
     return AngleCalibration(
         model=model,
         evidence=trial.evidence,
-        spread=final_spread(trial, model),
-        num_independent=num_independent(errors.seconds, errors.place, float(share)),
+        spread=final_spread(trial, model, weights),
+        num_independent=float(weights.sum()),
         correlation_time=azimuth.time,
         correlated_share=float(share),
         turn=turn,
@@ -320,13 +338,13 @@ def block_means(errors: AngleErrors, column: int, features: Array, chosen: NDArr
     )
 
 
-def folds_of(place: NDArray[np.int64], seconds: Array) -> NDArray[np.int64]:
+def folds_of(place: NDArray[np.int64], seconds: Array, *, most: int = _FOLDS) -> NDArray[np.int64]:
     """Return the fold of each measurement: places that follow each other are left out together."""
     places, inverse = np.unique(place, return_inverse=True)
     begin = np.array([seconds[place == each].min() for each in places])
     rank = np.empty(len(places), np.int64)
     rank[np.argsort(begin, kind="stable")] = np.arange(len(places))
-    return np.asarray(rank[inverse] * min(_FOLDS, len(places)) // len(places))
+    return np.asarray(rank[inverse] * min(most, len(places)) // len(places))
 
 
 def _held_out(errors: AngleErrors, model: Model, folds: NDArray[np.int64]) -> tuple[Array, Array]:

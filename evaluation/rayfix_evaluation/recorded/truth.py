@@ -21,6 +21,10 @@ LONGEST_GAP = 2.0
 """Seconds between two points of a path, up to which the target is taken to have moved evenly from one to the other."""
 
 
+SAME_PLACE = 0.25
+"""Metres up to which points that follow each other are of one place: a target at rest, in several rows."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Stay:
     """A target at rest.
@@ -38,11 +42,12 @@ class Stay:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Track:
-    """Stays, ascending and apart from each other, and points of a path."""
+    """Stays, ascending and apart from each other, and points of a path with the number of the place of each."""
 
     stays: tuple[Stay, ...]
     times: NDArray[np.float64]
     points: NDArray[np.float64]
+    places: NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,7 +69,10 @@ class Truth:
     unread: tuple[str, ...] = ()
 
     def at(self, target_id: str | None, seconds: float) -> tuple[NDArray[np.float64], int] | None:
-        """Position of a target at a time, shape (3,), m, and the number of the stay or stretch; None where unknown."""
+        """Position of a target at a time, shape (3,), m, and the number of the place; None where unknown.
+
+        A place is a stay, or the points of a path that follow each other within ``SAME_PLACE``.
+        """
         track = self.tracks.get(target_id) or self.tracks.get(None)
         if track is None:
             return None
@@ -75,12 +83,12 @@ class Truth:
         if n < 0 or (n == len(track.times) - 1 and seconds > track.times[n]):
             return None
         if seconds == track.times[n]:
-            return track.points[n].copy(), n
+            return track.points[n].copy(), int(track.places[n])
         gap = float(track.times[n + 1] - track.times[n])
         if gap > self.longest_gap:
             return None
         share = (seconds - float(track.times[n])) / gap
-        return track.points[n] + share * (track.points[n + 1] - track.points[n]), n
+        return track.points[n] + share * (track.points[n + 1] - track.points[n]), int(track.places[n])
 
 
 def read_truth(path: Path, *, longest_gap: float = LONGEST_GAP) -> Truth:
@@ -160,4 +168,16 @@ def _track(stays: list[Stay], points: list[tuple[float, ...]]) -> _Track:
     keep = np.append(np.diff(table[:, 0]) > 0.0, True) if len(table) else np.zeros(0, bool)
     table = table[keep]
     ordered = tuple(sorted(stays, key=lambda stay: stay.begin))
-    return _Track(stays=ordered, times=table[:, 0], points=table[:, 1:])
+    places = len(ordered) + _places(table[:, 1:])
+    return _Track(stays=ordered, times=table[:, 0], points=table[:, 1:], places=places)
+
+
+def _places(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Count places: a new one begins farther than ``SAME_PLACE`` from the first point of the last."""
+    numbers = np.zeros(len(points), np.int64)
+    first = 0
+    for n in range(1, len(points)):
+        apart = math.dist(points[n], points[first]) > SAME_PLACE
+        first = n if apart else first
+        numbers[n] = numbers[n - 1] + apart
+    return numbers

@@ -88,6 +88,10 @@ def test_a_calibrated_site_locates_better(folder: Path, capsys: pytest.CaptureFi
         assert angles["stdev_deg"] == pytest.approx([2.0, 2.0], rel=0.15)
     evidence = found["log_evidence_per_report"]
     assert evidence["after"] > evidence["before"]
+    held_out = found["held_out"]
+    assert (held_out["taken"], held_out["reports"]) == ("all", 200)
+    by_part = held_out["log_evidence_per_report"]
+    assert by_part["all"] > max(by_part["systematic"], by_part["deviations"]) > by_part["nothing"]
     assert (folder / "pictures" / "a.png").stat().st_size > 1000
     build_table(site, folder / "calibrated.h5", jobs=1, former=folder / "lab.h5")
     assert Table.open(folder / "calibrated.h5").site.has_deviations
@@ -95,6 +99,41 @@ def test_a_calibrated_site_locates_better(folder: Path, capsys: pytest.CaptureFi
     after, held = mean_error(folder / "calibrated.h5", other, other_truth, capsys)
     assert after < 0.8 * before
     assert 0.5 < held < 0.85
+
+
+def test_errors_that_differ_from_place_to_place_are_no_bias(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Thirty reports of a place repeat its error: taken for thirty errors, they told tails that were not there."""
+    rng = np.random.default_rng(5)
+    lines, truth = [], ["timestamp_s,x_m,y_m,z_m"]
+    for place in range(7):
+        x, y, z = rng.uniform([0.5, 0.5, 0.5], [7.5, 5.5, 1.8])
+        off = {name: 0.3 * rng.standard_t(2) for name in STATIONS}
+        for n in range(30):
+            seconds = 1_700_000_000 + 100 * place + n
+            measurements = [
+                {
+                    "type": "pt",
+                    "station_id": name,
+                    "range_m": float(np.linalg.norm(np.array([x, y, z]) - position)) + off[name] + 0.02 * rng.normal(),
+                    "stdev_m": 0.6,
+                }
+                for name, position in STATIONS.items()
+            ]
+            stamp = np.datetime64(seconds, "s").item().isoformat() + "Z"
+            lines.append(json.dumps({"target_id": "t", "timestamp": stamp, "measurements": measurements}))
+            truth.append(f"{seconds},{x},{y},{z}")
+    log, true, site = (folder / name for name in ("few.jsonl", "few.csv", "few.toml"))
+    log.write_text("\n".join(lines), encoding="utf-8")
+    true.write_text("\n".join(truth), encoding="utf-8")
+    command = ["calibrate", str(folder / "lab.h5"), str(log), "--truth", str(true), "-o", str(site)]
+    assert main([*command, "--no-progress", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {station["places"] for station in found["stations"].values()} == {7}
+    for station in found["stations"].values():
+        assert station["ranges"]["stdev_m"] > 0.1  # seven errors, and not two hundred that scatter by 0.02 m
+    held_out = found["held_out"]
+    evidence = held_out["log_evidence_per_report"]
+    assert evidence[held_out["taken"]] == max(evidence.values())
 
 
 def test_deviations_without_the_truth(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
