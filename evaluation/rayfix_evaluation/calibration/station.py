@@ -221,7 +221,9 @@ def final_spread(trial: AngleTrial, model: Model, weights: Array) -> Spread:
 
 
 def independent_shares(place: NDArray[np.int64], share: float) -> Array:
-    """Return what each measurement is worth in independent ones, shape (n,): at a place the correlated part counts once.
+    """Return the number of independent errors that each measurement is worth, shape (n,).
+
+    At a place, the correlated part counts once.
 
     Parameters
     ----------
