@@ -1,8 +1,11 @@
 """Fuse the measurements of a report: the product of their likelihoods and of the prior."""
 
+from collections.abc import Mapping
+
 from rayfix_service.fusion.measurements.calibrated import with_deviations
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
 from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.measurements.selection import selections_of
 from rayfix_service.fusion.posterior.fixes import Product
 from rayfix_service.fusion.posterior.summary import GaussianPosterior
 from rayfix_service.fusion.product.beam import multiply
@@ -13,7 +16,7 @@ from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.quadrature.engine import Quadrature
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
-from rayfix_tables.site import SiteInfo
+from rayfix_tables.site import Selection, SiteInfo
 from rayfix_tables.table import Table
 
 _MOST_MEASUREMENTS = 32
@@ -34,6 +37,11 @@ _FEWER_HYPOTHESES = (
 )
 
 _COARSER_GRID = "the position's surroundings were divided less finely, since there were too many parts"
+
+_OWN_RULE = (
+    "the selection rule of {} was not followed but that of the table, since times on a clock of unknown offset are "
+    "located with the table's Gaussians; send times on a known clock"
+)
 
 _SINGULAR = (
     "{} Gaussians were left out, since rounding made their covariances singular; give standard deviations that differ "
@@ -66,7 +74,10 @@ class Fusion:
         The estimate separates quick fixes from slow ones; it is infinite for a report that is slow in any case.
         """
         report = with_deviations(report, self.table.site)
-        seconds = self._quadrature.seconds(report) if len(report.measurements) <= _MOST_MEASUREMENTS else None
+        selections = selections_of(report, self.table.site, self.table)
+        seconds = (
+            self._quadrature.seconds(report, selections) if len(report.measurements) <= _MOST_MEASUREMENTS else None
+        )
         return self._cost.seconds(report) if seconds is None else seconds
 
     def product(
@@ -94,9 +105,13 @@ class Fusion:
         site = site or self.table.site
         sorted_report = sort_report(with_deviations(report, site), site)
         prior = self._prior(report)
-        if on_path_map and self._quadrature.suits(sorted_report):
-            return self._integrated(sorted_report, prior, stop)
-        return self._multiplied(sorted_report, prior, stop)
+        selections = selections_of(report, site, self.table)
+        if on_path_map and self._quadrature.suits(sorted_report, selections):
+            return self._integrated(sorted_report, prior, stop, selections)
+        product = self._multiplied(sorted_report, prior, stop)
+        if selections:
+            product = product._replace(simplified=(*product.simplified, _OWN_RULE.format(", ".join(selections))))
+        return product
 
     def _prior(self, report: Report) -> Prior:
         prior = self._uniform_prior
@@ -105,10 +120,12 @@ class Fusion:
             prior = height_prior(report.height, scene.free_space).raised(-float(scene.origin[2]))
         return prior
 
-    def _integrated(self, sorted_report: SortedReport, prior: Prior, stop: Stop) -> Product:
+    def _integrated(
+        self, sorted_report: SortedReport, prior: Prior, stop: Stop, selections: Mapping[str, Selection]
+    ) -> Product:
         """Integrate the posterior on the path map."""
         observations = list(sorted_report.observations)
-        posterior = self._quadrature.posterior(observations, prior, stop)
+        posterior = self._quadrature.posterior(observations, prior, stop, selections)
         simplified = (_COARSER_GRID,) if posterior.omitted else ()
         return Product(observations, dict(sorted_report.unused), prior, posterior, simplified)
 

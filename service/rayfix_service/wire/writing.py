@@ -18,6 +18,7 @@ from rayfix_service.wire.fields import METRES_PER_NANOSECOND
 from rayfix_service.wire.problems import FieldProblem, InvalidReportError
 from rayfix_service.wire.request import parse_report
 from rayfix_tables.geometry.angles import wrap_one
+from rayfix_tables.site import Selection
 
 
 def report_to_document(report: Report) -> dict[str, Any]:
@@ -41,9 +42,18 @@ def report_to_document(report: Report) -> dict[str, Any]:
         document["height"] = {"z_m": report.height.z, "stdev_m": report.height.stdev}
     if report.confidence != CONFIDENCE:
         document["confidence"] = report.confidence
+    if report.selection is not None:
+        document["selection"] = _selection(report.selection)
     document["measurements"] = [_measurement(measurement) for measurement in report.measurements]
     parse_report(document)
     return document
+
+
+def _selection(selection: Selection) -> dict[str, Any]:
+    if selection.rule == "strongest":
+        return {"rule": selection.rule, "exponent": selection.exponent}
+    within = {} if selection.within_db is None else {"within_db": selection.within_db}
+    return {"rule": selection.rule, **within}
 
 
 def _measurement(measurement: Measurement) -> dict[str, Any]:

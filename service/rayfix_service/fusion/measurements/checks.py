@@ -2,6 +2,7 @@
 
 import math
 import sys
+from typing import get_args
 
 from rayfix_service.fusion.measurements.report import (
     GAUSSIAN,
@@ -16,6 +17,7 @@ from rayfix_service.fusion.measurements.report import (
     TimeOfArrival,
 )
 from rayfix_tables.errors import ReportError
+from rayfix_tables.site import Rule, Selection
 from rayfix_tables.validation.limits import Limits
 from rayfix_tables.validation.problems import path_text
 
@@ -40,8 +42,9 @@ _LIMITS: dict[type, dict[str, Limits]] = {
     Height: {"z": _FINITE, "stdev": _STDEV},
     ErrorModel: {"tail_share": Limits(least=0.0, below=1.0), "tail_scale": Limits(least=1.0)},
     Report: {"confidence": Limits(above=0.0, below=1.0)},
+    Selection: {"exponent": Limits(least=0.0, most=20.0), "within_db": Limits(above=0.0, most=100.0)},
 }
-_OPTIONAL = frozenset({"zenith", "zenith_stdev", "los_probability"})
+_OPTIONAL = frozenset({"zenith", "zenith_stdev", "los_probability", "within_db"})
 
 
 def _closed(limits: Limits) -> tuple[float, float]:
@@ -81,6 +84,10 @@ def check_report(report: Report) -> Report:
     _check(report, ())
     if report.height is not None:
         _check(report.height, ("height",))
+    if report.selection is not None:
+        if report.selection.rule not in get_args(Rule):
+            _refuse(("selection", "rule"), report.selection.rule, f"one of {', '.join(get_args(Rule))}")
+        _check(report.selection, ("selection",))
     for index, measurement in enumerate(report.measurements):
         path = ("measurements", index)
         if not isinstance(measurement, Measurement):

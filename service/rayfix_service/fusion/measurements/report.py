@@ -6,6 +6,8 @@ The JSON of the HTTP interface is read into these by :mod:`rayfix_service.wire`.
 from dataclasses import dataclass, field
 from typing import Literal
 
+from rayfix_tables.site import Selection
+
 CONFIDENCE = 0.68
 """Probability with which accuracies hold where a report gives none."""
 
@@ -143,6 +145,8 @@ class Report:
     ----------
     confidence : float
         Probability, between 0 and 1, with which the accuracies in other systems' formats hold.
+    selection : Selection, optional
+        Rule by which the stations selected what they report; that of each station by default.
     """
 
     measurements: tuple[Measurement, ...]
@@ -150,3 +154,4 @@ class Report:
     confidence: float = CONFIDENCE
     target_id: str | None = None
     timestamp: str | None = None
+    selection: Selection | None = None
