@@ -8,9 +8,9 @@ The public API consists of the names in ``__all__`` of this package and of :mod:
 including the packages ``rayfix_*``, may change without notice. The names are
 
 - the table: ``build``, ``Table``;
-- a report and its parts: ``Report``, ``Angle``, ``Range``, ``LogRange``, ``TimeOfArrival``, ``TimeDifference``
-  (``Measurement`` is any of them), ``Height``, ``ErrorModel``, ``GAUSSIAN``, ``HEAVY_TAILED``, ``Frame``, and the
-  functions ``range_from_...`` with their results ``RangeEstimate`` and ``LogRangeEstimate``;
+- a report and its parts: ``Report``, ``Angle``, ``Range``, ``LogRange``, ``TimeOfArrival``, ``TimeDifference``,
+  ``MeasuredPath`` (``Measurement`` is any of them), ``Height``, ``ErrorModel``, ``GAUSSIAN``, ``HEAVY_TAILED``,
+  ``Frame``, and the functions ``range_from_...`` with their results ``RangeEstimate`` and ``LogRangeEstimate``;
 - the fusion and its answer: ``Locator``, ``FusionSettings``, ``Fix``, ``Status``, ``Candidate``, ``Outcome``,
   ``CredibleRegions``, ``Posterior``, ``Fused``; ``Stop`` ends a fix early, by ``FixStoppedError``;
 - tracks: ``Tracker``, ``TrackingSettings``, ``MotionModel``, ``TrackedPosition``, ``TrackState``, ``Estimate``;
@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from rayfix_service.fusion.measurements.report import Frame as Frame
     from rayfix_service.fusion.measurements.report import Height as Height
     from rayfix_service.fusion.measurements.report import LogRange as LogRange
+    from rayfix_service.fusion.measurements.report import MeasuredPath as MeasuredPath
     from rayfix_service.fusion.measurements.report import Measurement as Measurement
     from rayfix_service.fusion.measurements.report import Range as Range
     from rayfix_service.fusion.measurements.report import Report as Report
@@ -120,6 +121,7 @@ __all__ = [
     "Locator",
     "LogRange",
     "LogRangeEstimate",
+    "MeasuredPath",
     "Measurement",
     "MissingExtraError",
     "MotionModel",
@@ -168,6 +170,7 @@ _LAZY = {
         "Frame",
         "Height",
         "LogRange",
+        "MeasuredPath",
         "Measurement",
         "Range",
         "Report",

@@ -11,7 +11,7 @@ from rayfix_service.fusion.diagnosis.suspects import suspects
 from rayfix_service.fusion.diagnosis.turned import find_turns, turn_warning, turned_report
 from rayfix_service.fusion.fusion import Fusion
 from rayfix_service.fusion.measurements.checks import check_report
-from rayfix_service.fusion.measurements.report import Angle, Range, Report, TimeOfArrival
+from rayfix_service.fusion.measurements.report import Angle, MeasuredPath, Range, Report, TimeOfArrival
 from rayfix_service.fusion.posterior.credible import CredibleRegions
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.posterior.fixes import Product, make_fix
@@ -88,6 +88,8 @@ class Locator:
         """
         if fix.status != "inconsistent" or self.settings.most_turn_fixes == 0:
             return fix
+        if any(isinstance(measurement, MeasuredPath) for measurement in report.measurements):
+            return fix  # the search is one with Gaussians, of one path of each station
 
         def relocate(changed: Report, turns: Mapping[str, float]) -> Fix:
             changed, site = turned_report(changed, self.table.site, turns)

@@ -8,6 +8,7 @@ from rayfix_service.fusion.measurements.report import (
     Angle,
     ErrorModel,
     LogRange,
+    MeasuredPath,
     Measurement,
     Range,
     Report,
@@ -15,6 +16,7 @@ from rayfix_service.fusion.measurements.report import (
     TimeOfArrival,
 )
 from rayfix_service.wire.fields import METRES_PER_NANOSECOND
+from rayfix_service.wire.paths import path_to_document
 from rayfix_service.wire.problems import FieldProblem, InvalidReportError
 from rayfix_service.wire.request import parse_report
 from rayfix_tables.geometry.angles import wrap_one
@@ -60,6 +62,8 @@ def _measurement(measurement: Measurement) -> dict[str, Any]:
     match measurement:
         case Angle():
             return _angle(measurement) | _line_of_sight(measurement)
+        case MeasuredPath():
+            return path_to_document(measurement)
         case LogRange():
             return _signal_strength(measurement)
         case TimeDifference():

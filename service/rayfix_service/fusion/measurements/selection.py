@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 
-from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.measurements.report import MeasuredPath, Report
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import Selection, SiteInfo
 from rayfix_tables.table import Table
 
 
-def selections_of(report: Report, site: SiteInfo, table: Table) -> Mapping[str, Selection]:
+def selections_of(report: Report, site: SiteInfo) -> Mapping[str, Selection]:
     """Find the stations of a report whose rule is not the table's.
 
     Parameters
@@ -17,17 +17,12 @@ def selections_of(report: Report, site: SiteInfo, table: Table) -> Mapping[str, 
         Its rule goes before that of a station.
     site : SiteInfo
         Of the stations.
-    table : Table
 
     Returns
     -------
     mapping of str to Selection
         By the name of the station.
 
-    Raises
-    ------
-    ReportError
-        When the table has no gains, which other rules need.
     """
     if report.selection is None and not any(station.selection for station in site.stations):
         return {}
@@ -36,17 +31,33 @@ def selections_of(report: Report, site: SiteInfo, table: Table) -> Mapping[str, 
     for measurement in report.measurements:
         station = site.station_by_id.get(measurement.station_id)
         selection = report.selection or (station.selection if station is not None else None)
-        if station is None or selection is None or _same(selection, own):
+        if station is None or selection is None or _same(selection, own) or isinstance(measurement, MeasuredPath):
             continue
-        paths = table.parts[station.id].paths
-        if paths is None or len(paths.lit) < len(paths):
-            raise ReportError(
-                f"the table has no gains of the paths of station '{station.id}', which the rule "
-                f"{selection.rule!r} needs; build the table again with this version, or leave selection out",
-                path=("selection",),
-            )
         found[station.id] = selection
     return found
+
+
+def check_gains(selections: Mapping[str, Selection], table: Table) -> None:
+    """Check that a table has the gains of paths that rules need.
+
+    Raises
+    ------
+    ReportError
+        When it has not.
+    """
+    for name, selection in selections.items():
+        if not has_gains(table, name):
+            raise ReportError(
+                f"the table has no gains of the paths of station '{name}', which the rule {selection.rule!r} needs; "
+                "build the table again with this version, or leave selection out",
+                path=("selection",),
+            )
+
+
+def has_gains(table: Table, station_id: str) -> bool:
+    """Whether a table has the gains of a station's paths, which tables have since format 4."""
+    paths = table.parts[station_id].paths
+    return paths is not None and len(paths) > 0 and len(paths.lit) == len(paths)
 
 
 def _of_table(site: SiteInfo) -> Selection | None:

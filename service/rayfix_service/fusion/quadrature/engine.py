@@ -17,6 +17,7 @@ from rayfix_service.fusion.quadrature.blocks import BlockTree, StationPaths
 from rayfix_service.fusion.quadrature.grid import GridLimits, Leaves, integrate
 from rayfix_service.fusion.quadrature.observed import path_factor
 from rayfix_service.fusion.quadrature.reweighted import Reweighted
+from rayfix_service.fusion.quadrature.sets import NO_SETS, PathSets, SortedPaths, StationSet
 from rayfix_service.fusion.quadrature.summary import sum_up_leaves
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
@@ -42,6 +43,9 @@ _LEAST_SECONDS = 1e-3
 
 _FACTOR_SECONDS = 6e-4
 """What each measurement takes, s."""
+
+_SETS_SECONDS, _PATH_SECONDS = 1.5e-2, 2e-3
+"""What a report of several paths of a station takes, and each of them, s."""
 
 _POSITION = 3
 """Coordinates of a position: more measured numbers than that leave nothing open."""
@@ -152,12 +156,18 @@ class Quadrature:
         slow = 1.0 if known > _POSITION else _OPEN
         return _LEAST_SECONDS + _FACTOR_SECONDS * len(report.measurements) * combinations * slow
 
+    @staticmethod
+    def seconds_of_paths(count: int) -> float:
+        """Estimate how long a fix of so many measurements takes of which some are of paths, s."""
+        return _SETS_SECONDS + _PATH_SECONDS * count
+
     def posterior(
         self,
         observations: Sequence[Observation],
         prior: Prior,
         stop: Stop = NEVER,
         selections: Mapping[str, Selection] = NO_SELECTIONS,
+        paths: SortedPaths | None = None,
     ) -> GridPosterior:
         """Integrate the posterior of observations.
 
@@ -165,6 +175,8 @@ class Quadrature:
         ----------
         selections : mapping of str to Selection
             Rules of stations whose rule is not the table's.
+        paths : SortedPaths, optional
+            Measured paths of stations that report several.
 
         Raises
         ------
@@ -173,9 +185,21 @@ class Quadrature:
         """
         factors = [path_factor(each, self._settings, self._table.site.max_path_length) for each in observations]
         stations = [self._station(each.station_id, selections.get(each.station_id)) for each in observations]
-        leaves, omitted = integrate(self.tree, stations, factors, prior, self._limits, stop)
-        log_all_outlier = sum(float(np.log(factor.outlier)) for factor in factors)
+        sets = NO_SETS if paths is None else self._sets(paths)
+        leaves, omitted = integrate(self.tree, stations, factors, prior, self._limits, stop, sets)
+        log_all_outlier = sum(float(np.log(factor.outlier)) for factor in factors) + sets.log_all_spurious
         return GridPosterior(leaves=leaves, log_all_outlier=log_all_outlier, omitted=omitted)
+
+    def _sets(self, paths: SortedPaths) -> PathSets:
+        groups = []
+        for group in paths.groups:
+            sets = []
+            for name, within_db, measured in group:
+                stored = self._table.parts[name].paths
+                assert stored is not None
+                sets.append(StationSet(self._reweighted.detected(name, stored, self.tree, within_db), measured))
+            groups.append(tuple(sets))
+        return PathSets(groups=tuple(groups))
 
     @property
     def tree(self) -> BlockTree:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rayfix_service.fusion.quadrature.blocks import BlockPaths, BlockTree, StationPaths
-from rayfix_service.fusion.quadrature.selection import selected_paths
+from rayfix_service.fusion.quadrature.selection import detected_paths, selected_paths
 from rayfix_service.fusion.quadrature.spread import spread_paths
 from rayfix_tables.paths import PathMap
 from rayfix_tables.site import Selection
@@ -33,6 +33,10 @@ class Reweighted:
     def selected(self, name: str, paths: PathMap, tree: BlockTree, selection: Selection) -> StationPaths:
         """Paths of a station by their probability to be the one that it reports."""
         return self._found((name, selection), paths, tree, lambda wide: selected_paths(wide, selection))
+
+    def detected(self, name: str, paths: PathMap, tree: BlockTree, within_db: float) -> StationPaths:
+        """Paths of a station by their probabilities to be reported, where it reports all."""
+        return self._found((name, within_db), paths, tree, lambda wide: detected_paths(wide, within_db))
 
     def _found(self, key: Any, paths: PathMap, tree: BlockTree, weigh: Callable[[PathMap], BlockPaths]) -> StationPaths:
         with self._lock:
