@@ -8,9 +8,10 @@ The public API consists of the names in ``__all__`` of this package and of :mod:
 including the packages ``rayfix_*``, may change without notice. The names are
 
 - the table: ``build``, ``Table``;
-- a report and its parts: ``Report``, ``Angle``, ``Range``, ``LogRange``, ``TimeOfArrival``, ``TimeDifference``
-  (``Measurement`` is any of them), ``Height``, ``ErrorModel``, ``GAUSSIAN``, ``HEAVY_TAILED``, ``Frame``, and the
-  functions ``range_from_...`` with their results ``RangeEstimate`` and ``LogRangeEstimate``;
+- a report and its parts: ``Report``, ``Angle``, ``Range``, ``LogRange``, ``TimeOfArrival``, ``TimeDifference``,
+  ``MeasuredPath`` (``Measurement`` is any of them), ``Height``, ``ErrorModel``, ``GAUSSIAN``, ``HEAVY_TAILED``,
+  ``Frame``, and the functions ``range_from_...`` and ``paths_from_impulse_response`` with their results
+  ``RangeEstimate``, ``LogRangeEstimate`` and ``PathEstimate``;
 - the fusion and its answer: ``Locator``, ``FusionSettings``, ``Fix``, ``Status``, ``Candidate``, ``Outcome``,
   ``CredibleRegions``, ``Posterior``, ``Fused``; ``Stop`` ends a fix early, by ``FixStoppedError``;
 - tracks: ``Tracker``, ``TrackingSettings``, ``MotionModel``, ``TrackedPosition``, ``TrackState``, ``Estimate``;
@@ -62,6 +63,7 @@ if TYPE_CHECKING:
     from rayfix_service.fusion.measurements.report import Frame as Frame
     from rayfix_service.fusion.measurements.report import Height as Height
     from rayfix_service.fusion.measurements.report import LogRange as LogRange
+    from rayfix_service.fusion.measurements.report import MeasuredPath as MeasuredPath
     from rayfix_service.fusion.measurements.report import Measurement as Measurement
     from rayfix_service.fusion.measurements.report import Range as Range
     from rayfix_service.fusion.measurements.report import Report as Report
@@ -79,6 +81,8 @@ if TYPE_CHECKING:
     from rayfix_service.fusion.stopping import Stop as Stop
     from rayfix_service.http.errors import ServiceError as ServiceError
     from rayfix_service.locator import Locator as Locator
+    from rayfix_service.measuring.impulse_response import PathEstimate as PathEstimate
+    from rayfix_service.measuring.impulse_response import paths_from_impulse_response as paths_from_impulse_response
     from rayfix_service.measuring.impulse_response import range_from_impulse_response as range_from_impulse_response
     from rayfix_service.measuring.ranging import LogRangeEstimate as LogRangeEstimate
     from rayfix_service.measuring.ranging import RangeEstimate as RangeEstimate
@@ -120,11 +124,13 @@ __all__ = [
     "Locator",
     "LogRange",
     "LogRangeEstimate",
+    "MeasuredPath",
     "Measurement",
     "MissingExtraError",
     "MotionModel",
     "NotATableError",
     "Outcome",
+    "PathEstimate",
     "Posterior",
     "ProblemError",
     "ProblemField",
@@ -153,6 +159,7 @@ __all__ = [
     "ViewError",
     "__version__",
     "build",
+    "paths_from_impulse_response",
     "range_from_impulse_response",
     "range_from_round_trip",
     "range_from_rssi",
@@ -168,6 +175,7 @@ _LAZY = {
         "Frame",
         "Height",
         "LogRange",
+        "MeasuredPath",
         "Measurement",
         "Range",
         "Report",
@@ -192,7 +200,11 @@ _LAZY = {
         "range_from_rssi",
         "range_from_times",
     ),
-    ("rayfix_service.measuring.impulse_response", "service"): ("range_from_impulse_response",),
+    ("rayfix_service.measuring.impulse_response", "service"): (
+        "PathEstimate",
+        "paths_from_impulse_response",
+        "range_from_impulse_response",
+    ),
     ("rayfix_service.http.errors", "service"): ("ServiceError",),
     ("rayfix_service.adapters.mqtt.settings", "mqtt"): ("BrokerError",),
     ("rayfix_service.adapters.omlox_hub", "mqtt"): ("HubError",),

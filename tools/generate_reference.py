@@ -65,6 +65,7 @@ SECTIONS = (
     ("BiasSection", "bias of a station", "Measured minus true; the fusion takes it off. [Measurements](measurements.md#bias-of-a-station)."),
     ("AngleBiasSection", "bias that depends on the direction", "Written by `rayfix calibrate`; between the directions of the grid the fusion interpolates. [Calibration](calibration.md)."),
     ("DeviationsSection", "errors of a station's measurements", "Written by `rayfix calibrate`; the fusion takes them instead of what reports state. [Calibration](calibration.md)."),
+    ("SelectionSection", "selection of a station", "Which of the paths that it hears a station reports, where reports do not say it. [Selection](selection.md)."),
 )  # fmt: skip
 
 COMMAND_HEAD = """\

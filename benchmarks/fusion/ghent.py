@@ -1,7 +1,7 @@
 """Real UWB ranges in an industrial hall, most of them without line of sight, by calibration on half of the places.
 
-Reads ``meta_IIoT_19.csv`` of J. Fontaine's UWB data set, plain or gzip, with coordinates and ranges in mm: 19 anchors, 14
-places. Each half of the places is judged with the calibration by the other. No licence is stated, so the data are no
+Reads ``meta_IIoT_19.csv`` of J. Fontaine's UWB data set, plain or gzip, with coordinates and ranges in mm: 19 anchors,
+14 places. Each half of the places is judged with the calibration by the other. No licence is stated, so the data are no
 part of this repository. The twin is an empty hall, since racks and machines are not in the data (docs/real-data.md).
 """
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
-from rayfix_offline.site_sections import AngleBiasSection, DeviationsSection, RoomSection, Section
+from rayfix_offline.site_sections import AngleBiasSection, DeviationsSection, RoomSection, Section, SelectionSection
 from rayfix_tables.errors import SiteError
 from rayfix_tables.geometry.mounting import Boresight, boresight_of, orientation_of
 from rayfix_tables.site import Mounting, SiteInfo, Station, StationBias
@@ -261,6 +261,11 @@ class StationSection(Section):
         description="errors of its measurements, taken instead of what reports state: a table with the keys below",
         json_schema_extra={"effect": "nothing is built again"},
     )
+    selection: SelectionSection | None = Field(
+        default=None,
+        description="which of its paths it reports, if not by path_prior: a table with the keys below",
+        json_schema_extra={"effect": "nothing is built again"},
+    )
 
     @model_validator(mode="after")
     def _turned_once(self) -> "StationSection":
@@ -295,6 +300,7 @@ class StationSection(Section):
             ),
             mounting=self.mounting,
             deviations=None if self.deviations is None else self.deviations.deviations(),
+            selection=None if self.selection is None else self.selection.selection(),
         )
 
     def built_from(self) -> dict[str, Any]:
@@ -464,6 +470,7 @@ def _known_keys(location: tuple[str | int, ...]) -> list[str]:
         "bias": BiasSection,
         "angles": AngleBiasSection,
         "deviations": DeviationsSection,
+        "selection": SelectionSection,
     }
     for part in location:
         if isinstance(part, str) and part in sections:

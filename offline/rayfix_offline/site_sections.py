@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from rayfix_tables.site import AngleBias, Deviations
+from rayfix_tables.site import AngleBias, Deviations, Rule, Selection
 
 
 class Section(BaseModel):
@@ -103,6 +103,26 @@ class DeviationsSection(Section):
             tail_share=self.tail_share,
             tail_scale=self.tail_scale,
         )
+
+
+class SelectionSection(Section):
+    """``[stations.selection]``: which of the paths that it hears a station reports."""
+
+    rule: Rule = Field(
+        description="strongest, first (the earliest audible path), any (each audible path alike) or all (audible ones)"
+    )
+    exponent: Annotated[float, Field(ge=0, le=20)] = Field(
+        default=2.0, description="of strongest: how much the strong paths are preferred, as path_prior_exponent"
+    )
+    within_db: Annotated[float, Field(gt=0, le=100)] | None = Field(
+        default=None,
+        description="how much weaker than all paths together an audible one may be; 30 for first, 40 for any, 20 for "
+        "all unless given",
+    )
+
+    def selection(self) -> Selection:
+        """Return the rule as the table stores it."""
+        return Selection(rule=self.rule, exponent=self.exponent, within_db=self.within_db)
 
 
 def _row(degrees: tuple[float, ...]) -> tuple[float, ...]:

@@ -10,6 +10,7 @@ from rayfix.logs.entries import Entry, Place, Problem
 from rayfix_service.fusion.measurements.report import (
     Angle,
     LogRange,
+    MeasuredPath,
     Measurement,
     Range,
     Report,
@@ -128,6 +129,8 @@ def _kind(measurement: Measurement) -> tuple[object, ...]:
             return "angle", measurement.station_id, measurement.frame, measurement.zenith is None
         case TimeDifference():
             return "difference", measurement.station_id, measurement.reference_station_id
+        case MeasuredPath():
+            return "path", measurement  # which paths of two packets are the same one is for the fusion to find
     return type(measurement).__name__, measurement.station_id
 
 
@@ -165,5 +168,7 @@ def _middle(group: Sequence[Measurement], middle: Callable[[Sequence[float]], fl
             )
         case LogRange():
             return replace(first, path_length=of("path_length"), log_stdev=of("log_stdev"))
+        case MeasuredPath():
+            return first
         case TimeDifference():
             return replace(first, length_difference=of("length_difference"), stdev=of("stdev"))

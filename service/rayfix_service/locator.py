@@ -11,7 +11,8 @@ from rayfix_service.fusion.diagnosis.suspects import suspects
 from rayfix_service.fusion.diagnosis.turned import find_turns, turn_warning, turned_report
 from rayfix_service.fusion.fusion import Fusion
 from rayfix_service.fusion.measurements.checks import check_report
-from rayfix_service.fusion.measurements.report import Angle, Range, Report, TimeOfArrival
+from rayfix_service.fusion.measurements.report import Angle, MeasuredPath, Range, Report, TimeOfArrival
+from rayfix_service.fusion.measurements.selection import has_gains
 from rayfix_service.fusion.posterior.credible import CredibleRegions
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.fusion.posterior.fixes import Product, make_fix
@@ -88,6 +89,8 @@ class Locator:
         """
         if fix.status != "inconsistent" or self.settings.most_turn_fixes == 0:
             return fix
+        if any(isinstance(measurement, MeasuredPath) for measurement in report.measurements):
+            return fix  # the search is one with Gaussians, of one path of each station
 
         def relocate(changed: Report, turns: Mapping[str, float]) -> Fix:
             changed, site = turned_report(changed, self.table.site, turns)
@@ -190,6 +193,9 @@ class Locator:
                 at_first = Range(station_id=stations[0].id, path_length=5.0, stdev=0.5)
                 self.locate(Report(measurements=(angle, at_first)))
                 self.locate(Report(measurements=(angle, arrival, replace(arrival, station_id=stations[0].id))))
+        if has_gains(self.table, stations[0].id):
+            path = MeasuredPath(station_id=stations[0].id, azimuth=0.5, azimuth_stdev=window, length=5.0, stdev=0.5)
+            self.locate(Report(measurements=(path, replace(path, azimuth=0.6))))
         points = DrawnPoints(mean=np.zeros((1, 3)), root=np.eye(3)[None], owner=np.zeros(8, np.int16))
         regions = CredibleRegions(position=np.zeros(3), covariance=np.eye(3), points=points, share=1.0)
         regions.upright_ellipsoid(0.5)

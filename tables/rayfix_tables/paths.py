@@ -16,8 +16,13 @@ PATH_FIELDS: dict[str, tuple[type[np.generic], int]] = {
     "images": (np.float64, 2),
     "mirrors": (np.float64, 3),
     "num_reflections": (np.int8, 1),
+    "log_gain": (np.float16, 1),
+    "lit": (np.float16, 1),
 }
 """Type and number of axes of the arrays of a path map."""
+
+GAIN_FIELDS = frozenset({"log_gain", "lit"})
+"""Arrays that path maps have since version 4 of the table format; earlier ones have none of them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,6 +54,11 @@ class PathMap:
     mirrors : ndarray of float64, shape (n_sequences, 3, 3)
         Turn a direction at the station into the one after the last reflection.
     num_reflections : ndarray of int8, shape (n_sequences,)
+    log_gain : ndarray of float16, shape (n_paths,) or (0,)
+        Natural logarithm of the power gain relative to free space of the path's length, the mean over the voxel. Empty
+        in tables of former versions.
+    lit : ndarray of float16, shape (n_paths,) or (0,)
+        Fraction of the voxel's free part that the path reaches; empty as ``log_gain``.
     """
 
     origin: NDArray[np.float64]
@@ -62,6 +72,8 @@ class PathMap:
     images: NDArray[np.float64]
     mirrors: NDArray[np.float64]
     num_reflections: NDArray[np.int8]
+    log_gain: NDArray[np.float16]
+    lit: NDArray[np.float16]
 
     def __len__(self) -> int:
         """Return the number of paths."""

@@ -87,6 +87,36 @@ class StationBias:
 
 NO_BIAS = StationBias()
 
+Rule = Literal["strongest", "first", "any", "all"]
+"""Which of the paths that it hears a station reports."""
+
+REACH_DB: dict[Rule, float] = {"strongest": 40.0, "first": 30.0, "any": 40.0, "all": 20.0}
+"""By how much an audible path may be weaker than all together where nothing else is said."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """The rule by which a station selects the paths that it reports.
+
+    Attributes
+    ----------
+    rule : {"strongest", "first", "any", "all"}
+        The strongest path, the earliest audible one, any audible one alike, or all audible ones.
+    exponent : float
+        Of "strongest": a path is reported with a probability in proportion to its gain to this power.
+    within_db : float, optional
+        Paths that are weaker than all paths to a place together by less than this are audible; ``REACH_DB`` by default.
+    """
+
+    rule: Rule
+    exponent: float = 2.0
+    within_db: float | None = None
+
+    @property
+    def reach_db(self) -> float:
+        """By how much an audible path may be weaker than all together."""
+        return REACH_DB[self.rule] if self.within_db is None else self.within_db
+
 
 @dataclass(frozen=True, kw_only=True)
 class Station:
@@ -104,6 +134,8 @@ class Station:
     mounting : {"3gpp", "silabs", "ublox"}
         Which axes of the local frame are the array's boresight and upper edge.
     deviations : Deviations, optional
+    selection : Selection, optional
+        Rule by which it selects what it reports; the one that the table was built with by default.
     """
 
     id: str
@@ -113,6 +145,7 @@ class Station:
     bias: StationBias = NO_BIAS
     mounting: Mounting = "3gpp"
     deviations: Deviations | None = None
+    selection: Selection | None = None
 
     def moved(self, by: NDArray[np.float64]) -> "Station":
         """Return the station translated by a vector of shape (3,), m."""

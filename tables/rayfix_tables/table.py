@@ -26,13 +26,14 @@ from rayfix_tables.disk.schema import (
     read_bias,
     read_mounting,
 )
+from rayfix_tables.disk.selected import read_selection
 from rayfix_tables.disk.values import check_finite, check_offsets, check_range, check_rings
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import UNBALANCED, Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 from rayfix_tables.part import StationPart, Update
-from rayfix_tables.paths import PathMap
+from rayfix_tables.paths import GAIN_FIELDS, PathMap
 from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
 
@@ -119,6 +120,7 @@ class Table:
                 bias=replace(read_bias(attributes), angles=angles),
                 mounting=read_mounting(attributes),
                 deviations=deviations,
+                selection=read_selection(attributes),
             ).moved(scene.origin)
             levels = tuple(_read_level(path, layout, mapped) for path in _level_paths(layout, station_id))
             stations.append(station)
@@ -272,7 +274,12 @@ def _read_paths(
     if group not in layout.attributes:
         return None
     attributes = layout.attributes[group]
-    arrays = {name: layout.array(f"{group}/{name}", mapped) for name in PATH_DATASETS}
+    arrays = {
+        name: np.zeros(0, dtype)
+        if name in GAIN_FIELDS and f"{group}/{name}" not in layout.datasets
+        else layout.array(f"{group}/{name}", mapped)
+        for name, (dtype, _) in PATH_DATASETS.items()
+    }
     voxel_size = _positive(attributes["voxel_size_m"], f"voxel_size_m of {group}")
     refinement = max(1, round(voxel_size / free_space.voxel_size))
     shape = tuple((-(-np.array(free_space.free.shape) // refinement)).tolist())
@@ -287,6 +294,8 @@ def _read_paths(
         "images": (num_sequences, 3),
         "mirrors": (num_sequences, 3, 3),
         "num_reflections": (num_sequences,),
+        "log_gain": (len(arrays["lit"]) and count,),
+        "lit": (len(arrays["lit"]) and count,),
     }
     for name, expected in shapes.items():
         if arrays[name].shape != expected:

@@ -30,6 +30,7 @@ from rayfix_tables.disk.schema import (
     read_text,
     write_text,
 )
+from rayfix_tables.disk.selected import SELECTION, selection_text
 from rayfix_tables.errors import RayfixError, TableError
 from rayfix_tables.level import Level
 from rayfix_tables.mixture import FIELD_SHAPES
@@ -226,6 +227,8 @@ def _write_part(file: h5py.File, part: StationPart, origin: NDArray[np.float64])
     calibration = calibration_text(station)
     if calibration is not None:
         write_text(group, CALIBRATION, calibration)
+    if station.selection is not None:
+        write_text(group, SELECTION, selection_text(station.selection))
     write_text(group, "part_id", part.part_id)
     group.attrs["lost_ray_share"] = part.lost_ray_share
     group.attrs["coverage"] = np.asarray(part.coverage)

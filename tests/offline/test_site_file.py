@@ -113,7 +113,7 @@ def test_an_unknown_key_of_a_station(site_document: Document) -> None:
     document["stations"].append({"id": "bs2", "position_m": [1, 1, 1], "positon_m": [1, 1, 1]})
     expected = (
         "id, position_m, mounting, boresight_azimuth_deg, boresight_downtilt_deg, roll_deg, orientation_deg, "
-        "field_of_view_deg, bias, deviations"
+        "field_of_view_deg, bias, deviations, selection"
     )
     assert refused(document) == f"unknown key stations[1].positon_m; [stations] knows {expected}"
 

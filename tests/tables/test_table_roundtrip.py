@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rayfix_tables.disk.schema import FORMAT_VERSION, array_digest, read_text
+from rayfix_tables.disk.schema import FORMAT_VERSION, array_digest, read_text, write_text
 from rayfix_tables.errors import CorruptTableError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
 from rayfix_tables.part import Update
 from rayfix_tables.paths import PATH_FIELDS, PathMap
-from rayfix_tables.site import NO_BIAS, Station
+from rayfix_tables.site import NO_BIAS, Selection, Station
 from rayfix_tables.table import Table
 
 DEGREES = 1e-14  # relative; angles are stored in degrees
@@ -46,13 +46,14 @@ def assert_same_table(table: Table, content: Any) -> None:
         assert part.station.field_of_view == pytest.approx(station.field_of_view, rel=DEGREES)
         assert part.station.bias.angles == station.bias.angles
         assert part.station.deviations == station.deviations
+        assert part.station.selection == station.selection
         found, bias = (vars(replace(each.bias, angles=None)) for each in (part.station, station))
         del found["angles"], bias["angles"]
         assert found == pytest.approx(bias, rel=DEGREES)
         assert (part.lost_ray_share, part.coverage) == (written.lost_ray_share, written.coverage)
         assert (part.wall_coverage, part.cut_power_share) == (written.wall_coverage, written.cut_power_share)
         assert table.levels(station.id) is part.levels
-        assert_same_paths(part.paths, written.paths if table.format_version >= 3 else None)
+        assert_same_paths(part.paths, paths_in(table.format_version, written.paths))
         for level, expected in zip(part.levels, written.levels, strict=True):
             assert level.window == pytest.approx(expected.window, rel=DEGREES)
             assert (level.num_cells, level.num_components) == (expected.grid.num_cells, len(expected.mixture))
@@ -74,6 +75,15 @@ def assert_same_table(table: Table, content: Any) -> None:
     assert_same_bits(table.scene.free_space.free, scene.free_space.free)
     assert_same_bits(table.scene.free_space.origin, scene.free_space.origin)
     assert table.scene.free_space.voxel_size == scene.free_space.voxel_size
+
+
+def paths_in(version: int, paths: PathMap | None) -> PathMap | None:
+    """Return what a table of a version has of a station's map of paths."""
+    if paths is None or version < 3:
+        return None
+    if version == 3:
+        return replace(paths, log_gain=np.zeros(0, np.float16), lit=np.zeros(0, np.float16))
+    return paths
 
 
 def assert_same_paths(actual: PathMap | None, expected: PathMap | None) -> None:
@@ -129,6 +139,32 @@ def test_parts_of_other_stations_are_refused(make_content: Callable[..., Any], t
     with pytest.raises(ValueError, match="the parts of a table are those of its site's stations"):
         replace(content, parts=content.parts[::-1]).write(tmp_path / "t.h5")
     assert not list(tmp_path.iterdir())
+
+
+def with_selection(content: Any, selection: Selection) -> Any:
+    """Content whose stations select by a rule."""
+    stations = tuple(replace(station, selection=selection) for station in content.site.stations)
+    parts = tuple(replace(part, station=station) for part, station in zip(content.parts, stations, strict=True))
+    return replace(content, site=replace(content.site, stations=stations), parts=parts)
+
+
+@pytest.mark.parametrize(
+    "selection",
+    [Selection(rule="first"), Selection(rule="strongest", exponent=3.5), Selection(rule="any", within_db=7.0)],
+)
+def test_selection_rules_come_back(make_content: Callable[..., Any], tmp_path: Path, selection: Selection) -> None:
+    content = with_selection(make_content(0), selection)
+    content.write(tmp_path / "t.h5")
+    assert_same_table(Table.open(tmp_path / "t.h5"), content)
+
+
+@pytest.mark.parametrize("text", ["{}", '"first"', '{"rule": "loudest", "exponent": 2, "within_db": null}', "{"])
+def test_damaged_selection_rules_are_refused(make_content: Callable[..., Any], tmp_path: Path, text: str) -> None:
+    with_selection(make_content(0), Selection(rule="first")).write(tmp_path / "t.h5")
+    with h5py.File(tmp_path / "t.h5", "r+") as file:
+        write_text(file["stations/bs0"], "selection", text)
+    with pytest.raises(CorruptTableError):
+        Table.open(tmp_path / "t.h5")
 
 
 def test_extreme_numbers_come_back(make_content: Callable[..., Any], tmp_path: Path) -> None:
@@ -201,6 +237,15 @@ def test_a_table_of_format_2_is_still_read(make_content: Callable[..., Any]) -> 
     assert_same_table(table, make_content(1, num_stations=1, num_levels=1))
     assert table.format_version == 2
     assert table.table_id == "0f8e18f4ac3affc58843f00b295cd47e17c823f437c4985cf99b51e077d87313"
+    table.verify()
+
+
+def test_a_table_of_format_3_is_still_read(make_content: Callable[..., Any]) -> None:
+    """Its map of paths has no gains."""
+    table = Table.open(Path(__file__).parent / "stored" / "format-3.h5")
+    assert_same_table(table, make_content(1, num_stations=1, num_levels=1))
+    assert table.format_version == 3
+    assert table.table_id == "ccb62c9bcc064a2d42a9ca114ae1fa1c2594ba389079d452f4cb1ea8d0ecf14d"
     table.verify()
 
 

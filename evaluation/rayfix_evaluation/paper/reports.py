@@ -8,7 +8,15 @@ import numpy as np
 
 from rayfix_evaluation.paper.selection import RelativeLength
 from rayfix_service.fusion.measurements.directions import Direction, to_scene, without_bias
-from rayfix_service.fusion.measurements.report import GAUSSIAN, Angle, LogRange, Range, Report, TimeDifference
+from rayfix_service.fusion.measurements.report import (
+    GAUSSIAN,
+    Angle,
+    LogRange,
+    MeasuredPath,
+    Range,
+    Report,
+    TimeDifference,
+)
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station
 
@@ -61,7 +69,7 @@ def sort_for_paper(report: Report, site: SiteInfo) -> PaperReport:
     for index, measurement in enumerate(report.measurements):
         station = _station(measurement.station_id, stations, index)
         name, bias = station.id, station.bias
-        if isinstance(measurement, LogRange) or measurement.error_model != GAUSSIAN:
+        if isinstance(measurement, LogRange | MeasuredPath) or measurement.error_model != GAUSSIAN:
             _refuse(index, f"knows Gaussian errors only, which this {type(measurement).__name__} has not")
         known: Mapping[str, object]
         if isinstance(measurement, Angle):

@@ -4,6 +4,7 @@ A reflection sequence has one image of the station and one mirror matrix, which 
 any position exactly. Which sequences reach a voxel, and what share of its volume, is what the rays tell.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numba
@@ -18,12 +19,20 @@ from rayfix_offline.rays.settings import PathKind
 from rayfix_offline.rays.voxelwalk import VoxelWalk, over_ray_ranges, power, walk
 from rayfix_tables.paths import PathMap
 
+_LN10 = math.log(10.0)
+_DECIBELS = 10.0
+
 
 class FieldOfView(NamedTuple):
     """A cone of directions about an axis, a unit vector of shape (3,); its half opening angle is in radians."""
 
     axis: NDArray[np.float64]
     half_angle: float
+
+
+def least_share(floor_db: float, exponent: float) -> float:
+    """Fraction of the sum of gain^beta that a path has which is so much weaker than all together."""
+    return math.exp(-_LN10 / _DECIBELS * floor_db * exponent)
 
 
 def fill_path_map(
@@ -72,7 +81,7 @@ def fill_path_map(
     found = over_ray_ranges(fill, len(rays), jobs)
     keys, place = np.unique(np.concatenate([each[0] for each in found]), return_inverse=True)
     sums = np.concatenate([each[1] for each in found])
-    volume, strength, excess, walls = (np.bincount(place, sums[:, n], len(keys)) for n in range(4))
+    volume, strength, excess, walls, log_gain = (np.bincount(place, sums[:, n], len(keys)) for n in range(5))
     voxel, sequence = np.divmod(keys, len(segments.sequences.images))
     # Rays reach a little more or less of a voxel than there is of it: that is noise of their number.
     lit = np.minimum(volume / prior.free_volume.reshape(-1)[voxel], 1.0)
@@ -103,6 +112,8 @@ def fill_path_map(
         images=segments.sequences.images[used],
         mirrors=segments.sequences.mirrors[used],
         num_reflections=segments.sequences.num_reflections[used],
+        log_gain=(_LN10 * log_gain / volume)[order].astype(np.float16),
+        lit=lit[order].astype(np.float16),
     )
 
 
@@ -114,14 +125,14 @@ def _fill(rays: Any, solid_angle: Any, exponent: Any, least_share: Any, room: An
     -------
     keys : ndarray of int64, shape (n,)
         A hash table of ``voxel * n_sequences + sequence``; -1 where it is empty.
-    sums : ndarray of shape (n, 4)
-        Integrals over the parts of rays in the voxel of solid angle x length^2: as it is [m3], times gain^beta, and
-        that times the excess length [m] and times the number of walls.
+    sums : ndarray of shape (n, 5)
+        Integrals over the parts of rays in the voxel of solid angle x length^2: as it is [m3], times gain^beta, that
+        times the excess length [m] and times the number of walls; and times the logarithm to base 10 of the gain.
     """
     voxel, lengths, voxels = room.voxel_size, room.lengths, room.voxels
     num_sequences = len(rays.images)
     size = 1 << 16
-    keys, sums = np.full(size, -1, np.int64), np.zeros((size, 4))
+    keys, sums = np.full(size, -1, np.int64), np.zeros((size, 5))
     count = 0
     for ray in range(len(solid_angle)):
         for segment in range(rays.offsets[ray], rays.offsets[ray + 1]):
@@ -151,6 +162,7 @@ def _fill(rays: Any, solid_angle: Any, exponent: Any, least_share: Any, room: An
                 sums[slot, 1] += covered * gain
                 sums[slot, 2] += covered * gain * rays.excess[segment]
                 sums[slot, 3] += covered * gain * rays.num_walls[segment]
+                sums[slot, 4] += covered * rays.log_gain[segment]
     return keys, sums
 
 

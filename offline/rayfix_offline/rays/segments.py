@@ -94,6 +94,8 @@ class SegmentArrays(NamedTuple):
         Launch directions.
     factors : ndarray of shape (n_segments,)
         Factor of gain^beta due to the walls before a segment.
+    log_gain
+        As in :class:`Segments`.
     """
 
     offsets: NDArray[np.int64]
@@ -107,6 +109,7 @@ class SegmentArrays(NamedTuple):
     num_reflections: NDArray[np.int8]
     directions: NDArray[np.float64]
     factors: NDArray[np.float64]
+    log_gain: NDArray[np.float64]
 
     @classmethod
     def of(
@@ -125,4 +128,5 @@ class SegmentArrays(NamedTuple):
             num_reflections=segments.sequences.num_reflections,
             directions=directions[first:stop],
             factors=factors,
+            log_gain=segments.log_gain,
         )

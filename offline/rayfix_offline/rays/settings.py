@@ -36,8 +36,8 @@ class RaySettings:
         Largest spacing of the rays that fill the path prior, at the far end of the scene, in voxels of its map.
     prior_spacing : float, rad
         Smallest spacing of rays that are launched for the path prior only.
-    least_path_share : float
-        The path map leaves out paths that carry less than this fraction of the sum of gain^beta at a place.
+    path_floor_db : float
+        The path map leaves out paths that are weaker than all paths to a place together by more than this.
     """
 
     rays_per_window: float = 3.0
@@ -52,4 +52,4 @@ class RaySettings:
     prior_refinement: int = 2
     prior_rays: float = 0.7
     prior_spacing: float = 0.0073
-    least_path_share: float = 1e-3
+    path_floor_db: float = 40.0

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.rays.launch import launch
-from rayfix_offline.rays.pathmap import FieldOfView, fill_path_map
+from rayfix_offline.rays.pathmap import FieldOfView, fill_path_map, least_share
 from rayfix_offline.rays.pathprior import fill_path_prior
 from rayfix_offline.rays.pieces import Pieces, cut_pieces
 from rayfix_offline.rays.rays import RaySet, sample_rays
@@ -169,7 +169,7 @@ def trace_station(
         prior,
         exponent=exponent,
         kind=site.propagation.path_prior,
-        least_share=settings.least_path_share,
+        least_share=least_share(settings.path_floor_db, exponent),
         field_of_view=FieldOfView(board_to_scene(looks)[:, 0], 0.5 * looks.field_of_view)
         if looks.field_of_view < 2.0 * np.pi
         else None,

@@ -11,6 +11,7 @@ import numpy as np
 from rayfix_service.adapters.adapted import Adapted, Skipped, adapted_report, station_of
 from rayfix_service.adapters.documents import check, one_of, too_much
 from rayfix_service.adapters.nrppa_documents import (
+    AdditionalPath,
     AngleQuality,
     GnbRxTx,
     LcsToGcs,
@@ -26,9 +27,16 @@ from rayfix_service.adapters.nrppa_documents import (
     Zoa,
     unwrapped,
 )
-from rayfix_service.adapters.report_mapping import ANGLE_STEP, Interval, angle_interval, time_interval
+from rayfix_service.adapters.report_mapping import ANGLE_STEP, PATH_TC, Interval, angle_interval, time_interval
 from rayfix_service.fusion.measurements.directions import to_scene
-from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, TimeOfArrival
+from rayfix_service.fusion.measurements.report import (
+    Angle,
+    MeasuredPath,
+    Measurement,
+    PathClock,
+    Range,
+    TimeOfArrival,
+)
 from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits
 from rayfix_tables.geometry.angles import wrap_one
 from rayfix_tables.site import Station
@@ -44,7 +52,8 @@ _NO_AZIMUTH = "a zenith angle without an azimuth cannot be used; report UL-AoA w
 _NO_ZENITH = "an azimuth without a zenith angle cannot be turned by beta and gamma; report zenithAoA as well"
 _ALONE = "a gNB's Rx-Tx time difference is a range only together with the UE's; give that in ue_rx_tx"
 _POWER = "powers and phases are not used"
-_MORE_PATHS = "times of additional paths are not used; angles of several paths are, as MultipleULAoA"
+_MORE_ANGLES = "of an additional path one angle is used, with an azimuth; give that first"
+_NO_INDICATION = "of several paths, which one is direct follows from the table"
 
 _LISTS = ("TRP-MeasurementResponseList", "TRP-MeasurementReportList")
 
@@ -61,7 +70,8 @@ def parse_nrppa(
     geographic north, counter-clockwise (TS 38.215, clause 5.2.4); angles with a translation from a local coordinate
     system are rotated by it. UL-RTOA becomes a time of arrival: its reference time and the time of transmission are
     unknown, and the same for all TRPs. The Rx-Tx time differences of a gNB and of the UE add to the round trip, so that
-    c / 2 times their sum is the path length (TS 38.305, clause 8.10).
+    c / 2 times their sum is the path length (TS 38.305, clause 8.10). Where a message has additional paths, times of
+    arrival become paths, and so do ranges with additional paths; a TRP's only angle is that of its first path then.
 
     Parameters
     ----------
@@ -93,12 +103,15 @@ def parse_nrppa(
         ranges_to.setdefault(ue.trp_id, []).append(ue)
     measurements: list[tuple[Path, Measurement]] = []
     skipped: list[Skipped] = []
+    as_paths = any(_paths_of(item) for trp in document.response or document.report or () for item in trp.results)
     for i, trp in enumerate(document.response or document.report or ()):
         converter = _Converter(
             document=document,
             station_id=station_of(str(trp.trp_id), document.stations, stations),
             ue_rx_tx=ranges_to.get(trp.trp_id, []),
+            as_paths=as_paths,
         )
+        first = len(measurements)
         for k, item in enumerate(trp.results):
             path: Path = (name, i, "measurementResult", k)
             for place, outcome in converter.convert(item):
@@ -106,10 +119,13 @@ def parse_nrppa(
                     skipped.append(Skipped(path=(*path, *place), reason=outcome))
                 else:
                     measurements.append(((*path, *place), _with_line_of_sight(outcome, item.los)))
+            if item.los is not None and _paths_of(item):
+                skipped.append(Skipped(path=(*path, "LoS-NLoSInformation"), reason=_NO_INDICATION))
             if len(measurements) + len(skipped) > 2 * limits.results:  # each may be one range for every ue_rx_tx
                 most = 2 * limits.results
                 text = f"ue_rx_tx makes more than {most} measurements of the message's; give one for each TRP"
                 raise too_much(("ue_rx_tx",), text)
+        measurements[first:] = _with_angle(measurements[first:]) if as_paths else measurements[first:]
     return adapted_report(
         measurements,
         skipped,
@@ -137,6 +153,10 @@ def _check_counts(most: int, message: Mapping[str, Any]) -> None:
                 several = value.get("MultipleULAoA") if isinstance(value, Mapping) else None
                 angles = several.get("multipleULAoA") if isinstance(several, Mapping) else None
                 num_results += max(len(_array(angles)), 1)
+                for time in ("uL-RTOA", "gNB-RxTxTimeDiff"):
+                    measured = value.get(time) if isinstance(value, Mapping) else None
+                    for paths in ("additionalPathList", "ExtendedAdditionalPathList"):
+                        num_results += len(_array(measured.get(paths) if isinstance(measured, Mapping) else None))
                 if num_results > most:
                     text = f"{path_text((name,))} has more than {most} measurements; give at most as many at once"
                     raise too_much((name,), text)
@@ -153,8 +173,9 @@ class _Converter:
     document: NrppaDocument
     station_id: str
     ue_rx_tx: list[UeRxTx]
+    as_paths: bool
 
-    def convert(self, item: ResultItem) -> Iterator[tuple[Path, Angle | Range | TimeOfArrival | str]]:
+    def convert(self, item: ResultItem) -> Iterator[tuple[Path, Angle | Range | TimeOfArrival | MeasuredPath | str]]:
         """Convert one item, which may hold several measurements or none."""
         name, value = one_of(item.value)
         path: Path = ("measuredResultsValue", name)
@@ -170,11 +191,10 @@ class _Converter:
             case "ZoA":
                 yield path, _NO_AZIMUTH
             case "uL-RTOA":
-                yield path, self._arrival(value.time, timing)
-                yield from _additional_paths(path, value)
+                yield from self._with_paths(path, value, self._arrival(value.time, timing))
             case "gNB-RxTxTimeDiff":
-                yield from ((path, outcome) for outcome in self._ranges(value.time, timing))
-                yield from _additional_paths(path, value)
+                for outcome in self._ranges(value.time, timing):
+                    yield from self._with_paths(path, value, outcome)
             case _:
                 yield path, _POWER
 
@@ -210,6 +230,39 @@ class _Converter:
         )
         return angle if measured.translation is None else _to_global(measured.translation, angle)
 
+    def _with_paths(
+        self, path: Path, value: UlRtoa | GnbRxTx, first: TimeOfArrival | Range | str
+    ) -> Iterator[tuple[Path, TimeOfArrival | Range | MeasuredPath | str]]:
+        """Convert a time and those of additional paths, which count from it."""
+        listed = _listed_paths(value)
+        if isinstance(first, str) or not self.as_paths or (isinstance(first, Range) and not listed):
+            yield path, first
+            return
+        clock: PathClock = "known" if isinstance(first, Range) else "ue"
+        measured = MeasuredPath(station_id=self.station_id, length=first.path_length, stdev=first.stdev, clock=clock)
+        yield path, measured
+        for name, n, additional in listed:
+            place = (*path, name, n)
+            delay = time_interval(*additional.time.value_and_k(), PATH_TC)
+            if delay is None:
+                yield (*place, "relativeTimeOfPath"), _BEYOND
+                continue
+            timing = additional.quality.timing if additional.quality else None
+            variance = self._time_variance(delay, timing)
+            one = replace(
+                measured,
+                length=first.path_length + delay.middle,
+                stdev=min(math.sqrt(variance), _LARGEST_STDEV_M),
+                power_db=None if additional.power is None else float(additional.power.first),
+            )
+            angles = () if additional.angles is None else additional.angles.angles
+            angle = self._angle(one_of(angles[0])[1], None) if angles else None
+            if isinstance(angle, Angle):
+                one = _directed(one, angle)
+            yield place, one
+            if isinstance(angle, str) or len(angles) > 1:
+                yield (*place, "multipleULAoA"), _MORE_ANGLES
+
     def _arrival(self, time: TimeChoice, quality: TimingQuality | None) -> TimeOfArrival | str:
         measured = time_interval(*time.value_and_k())
         if measured is None:
@@ -243,16 +296,49 @@ class _Converter:
         return (_steps(quality.value) * _RESOLUTION_M[quality.resolution]) ** 2 + measured.variance
 
 
-def _additional_paths(path: Path, value: UlRtoa | GnbRxTx) -> Iterator[tuple[Path, str]]:
-    if value.additional_paths is not None:
-        yield (*path, "additionalPathList"), _MORE_PATHS
-    if value.more_paths is not None:
-        yield (*path, "ExtendedAdditionalPathList"), _MORE_PATHS
+def _listed_paths(value: UlRtoa | GnbRxTx) -> list[tuple[str, int, AdditionalPath]]:
+    """Additional paths of a time, with the name of their list and their place in it."""
+    lists = (("additionalPathList", value.additional_paths), ("ExtendedAdditionalPathList", value.more_paths))
+    return [(name, n, path) for name, paths in lists for n, path in enumerate(paths or ())]
 
 
-def _with_line_of_sight(measurement: Angle | Range | TimeOfArrival, los: LosInformation | None) -> Measurement:
+def _paths_of(item: ResultItem) -> bool:
+    """Whether an item is a time with additional paths."""
+    value = one_of(item.value)[1]
+    return isinstance(value, UlRtoa | GnbRxTx) and bool(_listed_paths(value))
+
+
+def _directed(measured: MeasuredPath, angle: Angle) -> MeasuredPath:
+    """Add a direction to a path; the errors of its angles count as independent."""
+    return replace(
+        measured,
+        azimuth=angle.azimuth,
+        azimuth_stdev=angle.azimuth_stdev,
+        zenith=angle.zenith,
+        zenith_stdev=angle.zenith_stdev,
+        frame=angle.frame,
+    )
+
+
+def _with_angle(measurements: list[tuple[Path, Measurement]]) -> list[tuple[Path, Measurement]]:
+    """Add the only angle of a TRP to the first of its paths, which it is of."""
+    angles = [n for n, (_, measured) in enumerate(measurements) if isinstance(measured, Angle)]
+    paths = [n for n, (_, measured) in enumerate(measurements) if isinstance(measured, MeasuredPath)]
+    if len(angles) != 1 or not paths:
+        return measurements
+    place, first = measurements[paths[0]]
+    angle = measurements[angles[0]][1]
+    assert isinstance(first, MeasuredPath)
+    assert isinstance(angle, Angle)
+    joined = {paths[0]: (place, _directed(first, angle))}
+    return [joined.get(n, each) for n, each in enumerate(measurements) if n != angles[0]]
+
+
+def _with_line_of_sight(
+    measurement: Angle | Range | TimeOfArrival | MeasuredPath, los: LosInformation | None
+) -> Measurement:
     """Add the TRP's line-of-sight indicator; a hard one is a probability of 0 or 1."""
-    if los is None:
+    if los is None or isinstance(measurement, MeasuredPath):
         return measurement
     name, value = one_of(los)
     return replace(measurement, los_probability=value / 10.0 if name.endswith("Soft") else float(value == "los"))

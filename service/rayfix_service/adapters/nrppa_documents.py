@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from rayfix_service.adapters.documents import KnownHeight, Stations, TargetId, Timestamp, integer, not_used, one_of
-from rayfix_service.adapters.report_mapping import largest_time_value
+from rayfix_service.adapters.report_mapping import PATH_TC, largest_time_value
 from rayfix_service.fusion.measurements.report import CONFIDENCE
 from rayfix_service.wire import MAX_MEASUREMENTS, MAX_REPORTS, FieldProblem, InvalidReportError, WireModel
 from rayfix_service.wire.fields import Confidence, misfit
@@ -110,43 +110,35 @@ class TimeChoice(ChoiceModel):
         return value, int(name.removeprefix("k")) if name.startswith("k") else -int(name[-1])
 
 
-class UlRtoa(WireModel):
-    """UL-RTOAMeasurement."""
+def _path_time(k: int) -> Any:
+    return integer(largest_time_value(k, PATH_TC), f"a time after the first path in steps of Tc * 2^{k}")
 
-    model_config = ConfigDict(title="UL-RTOAMeasurement")
 
-    time: TimeChoice = Field(alias="uLRTOAmeas")
-    additional_paths: Any = not_used("additionalPathList")
-    more_paths: Any = not_used("ExtendedAdditionalPathList")
-    timing_group: Any = not_used("TRP-Rx-TEGInformation")
+class RelativePathDelay(ChoiceModel):
+    """RelativePathDelay: how much later than the first a path arrives, in steps of Tc 2^k."""
+
+    model_config = ConfigDict(title="RelativePathDelay")
+
+    k0: Annotated[int, _path_time(0)] | None = None
+    k1: Annotated[int, _path_time(1)] | None = None
+    k2: Annotated[int, _path_time(2)] | None = None
+    k3: Annotated[int, _path_time(3)] | None = None
+    k4: Annotated[int, _path_time(4)] | None = None
+    k5: Annotated[int, _path_time(5)] | None = None
+
+    def value_and_k(self) -> tuple[int, int]:
+        """Return the reported integer and the exponent of its step."""
+        name, value = one_of(self)
+        return value, int(name[1])
+
+
+class PathPower(WireModel):
+    """UL-SRS-RSRPP: the power of a path, in steps of 1 dB."""
+
+    model_config = ConfigDict(title="UL-SRS-RSRPP")
+
+    first: Annotated[int, integer(126, "a power in dB")] = Field(alias="firstPathRSRPP")
     extensions: Any = not_used("iE-extensions")
-
-
-class GnbRxTx(WireModel):
-    """GNB-RxTxTimeDiff."""
-
-    model_config = ConfigDict(title="GNB-RxTxTimeDiff")
-
-    time: TimeChoice = Field(alias="rxTxTimeDiff")
-    additional_paths: Any = not_used("additionalPathList")
-    more_paths: Any = not_used("ExtendedAdditionalPathList")
-    timing_group: Any = not_used("TRPTEGInformation")
-    extensions: Any = not_used("iE-Extensions")
-
-
-class MeasuredResultsValue(ChoiceModel):
-    """TrpMeasuredResultsValue."""
-
-    model_config = ConfigDict(title="TrpMeasuredResultsValue")
-
-    aoa: UlAoa | None = Field(default=None, alias="uL-AngleOfArrival")
-    rsrp: Any = not_used("uL-SRS-RSRP")
-    rtoa: UlRtoa | None = Field(default=None, alias="uL-RTOA")
-    rx_tx: GnbRxTx | None = Field(default=None, alias="gNB-RxTxTimeDiff")
-    zoa: Zoa | None = Field(default=None, alias="ZoA")
-    multiple_aoa: MultipleUlAoa | None = Field(default=None, alias="MultipleULAoA")
-    rsrpp: Any = not_used("UL-SRS-RSRPP")
-    rscp: Any = not_used("UL-RSCPMeas")
 
 
 class TimingQuality(WireModel):
@@ -180,6 +172,73 @@ class Quality(ChoiceModel):
     timing: TimingQuality | None = Field(default=None, alias="timingMeasQuality")
     angle: AngleQuality | None = Field(default=None, alias="angleMeasQuality")
     phase: Any = not_used("TRPPhaseQuality")
+
+
+class AdditionalPath(WireModel):
+    """AdditionalPathListItem and ExtendedAdditionalPathList-Item, which has angles and power as elements of its own."""
+
+    model_config = ConfigDict(title="AdditionalPathListItem")
+
+    time: RelativePathDelay = Field(alias="relativeTimeOfPath")
+    quality: Quality | None = Field(default=None, alias="pathQuality")
+    angles: MultipleUlAoa | None = Field(default=None, alias="multipleULAoA")
+    power: PathPower | None = Field(default=None, alias="pathPower")
+    extensions: Any = not_used("iE-Extensions")
+
+
+class UlRtoa(WireModel):
+    """UL-RTOAMeasurement."""
+
+    model_config = ConfigDict(title="UL-RTOAMeasurement")
+
+    time: TimeChoice = Field(alias="uLRTOAmeas")
+    additional_paths: list[AdditionalPath] | None = Field(
+        default=None, alias="additionalPathList", min_length=1, max_length=2, description="an array of 1 or 2 paths"
+    )
+    more_paths: list[AdditionalPath] | None = Field(
+        default=None,
+        alias="ExtendedAdditionalPathList",
+        min_length=1,
+        max_length=8,
+        description="an array of 1 to 8 paths",
+    )
+    timing_group: Any = not_used("TRP-Rx-TEGInformation")
+    extensions: Any = not_used("iE-extensions")
+
+
+class GnbRxTx(WireModel):
+    """GNB-RxTxTimeDiff."""
+
+    model_config = ConfigDict(title="GNB-RxTxTimeDiff")
+
+    time: TimeChoice = Field(alias="rxTxTimeDiff")
+    additional_paths: list[AdditionalPath] | None = Field(
+        default=None, alias="additionalPathList", min_length=1, max_length=2, description="an array of 1 or 2 paths"
+    )
+    more_paths: list[AdditionalPath] | None = Field(
+        default=None,
+        alias="ExtendedAdditionalPathList",
+        min_length=1,
+        max_length=8,
+        description="an array of 1 to 8 paths",
+    )
+    timing_group: Any = not_used("TRPTEGInformation")
+    extensions: Any = not_used("iE-Extensions")
+
+
+class MeasuredResultsValue(ChoiceModel):
+    """TrpMeasuredResultsValue."""
+
+    model_config = ConfigDict(title="TrpMeasuredResultsValue")
+
+    aoa: UlAoa | None = Field(default=None, alias="uL-AngleOfArrival")
+    rsrp: Any = not_used("uL-SRS-RSRP")
+    rtoa: UlRtoa | None = Field(default=None, alias="uL-RTOA")
+    rx_tx: GnbRxTx | None = Field(default=None, alias="gNB-RxTxTimeDiff")
+    zoa: Zoa | None = Field(default=None, alias="ZoA")
+    multiple_aoa: MultipleUlAoa | None = Field(default=None, alias="MultipleULAoA")
+    rsrpp: Any = not_used("UL-SRS-RSRPP")
+    rscp: Any = not_used("UL-RSCPMeas")
 
 
 class LosInformation(ChoiceModel):

@@ -18,6 +18,9 @@ TC_METRES = TC_NANOSECONDS * METRES_PER_NANOSECOND
 RANGE_TC = 985024
 """UL-RTOA and Rx-Tx time differences are reported from minus to plus this many Tc (TS 38.133, 13.1.1, 13.2.1)."""
 
+PATH_TC = 8175
+"""Times of additional paths are reported from minus to plus this many Tc (TS 38.133, 13.1.2), relative to the first."""
+
 ANGLE_STEP = math.radians(0.1)
 """Resolution of angles of arrival (TS 38.133, 13.4.1), rad."""
 
@@ -35,16 +38,16 @@ class Interval:
         return self.width**2 / 12.0
 
 
-def largest_time_value(k: int) -> int:
-    """Return the largest integer of a time report with steps of Tc 2^k.
+def largest_time_value(k: int, reach: int = RANGE_TC) -> int:
+    """Return the largest integer of a time report with steps of Tc 2^k, from minus to plus ``reach`` Tc.
 
     There are 2 x 985024 / 2^k intervals between the ends of the range, one below and one above, counted from 0:
     1970049 for k = 0 and 61565 for k = 5, as in the ASN.1 of TS 38.455.
     """
-    return int(2 * RANGE_TC / 2.0**k) + 1
+    return int(2 * reach / 2.0**k) + 1
 
 
-def time_interval(value: int, k: int) -> Interval | None:
+def time_interval(value: int, k: int, reach: int = RANGE_TC) -> Interval | None:
     """Decode UL-RTOA or an Rx-Tx time difference (TS 38.133, tables 13.1.1-1 to -12 and 13.2.1-1 to -12).
 
     Value v stands for ``-985024 + (v - 1) 2^k <= time / Tc < -985024 + v 2^k``.
@@ -55,16 +58,18 @@ def time_interval(value: int, k: int) -> Interval | None:
         From 0 to :func:`largest_time_value`.
     k : int
         Exponent of the step, -6 to 5.
+    reach : int
+        What the range ends at, Tc.
 
     Returns
     -------
     Interval or None
         As a length, m; None for the first and the last value, which stand for everything beyond the range.
     """
-    if not 0 < value < largest_time_value(k):
+    if not 0 < value < largest_time_value(k, reach):
         return None
     step = 2.0**k
-    return Interval(middle=(-RANGE_TC + (value - 0.5) * step) * TC_METRES, width=step * TC_METRES)
+    return Interval(middle=(-reach + (value - 0.5) * step) * TC_METRES, width=step * TC_METRES)
 
 
 def angle_interval(value: int, *, zero: float = 0.0) -> Interval:

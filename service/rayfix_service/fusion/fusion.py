@@ -1,8 +1,11 @@
 """Fuse the measurements of a report: the product of their likelihoods and of the prior."""
 
+from collections.abc import Mapping, Sequence
+
 from rayfix_service.fusion.measurements.calibrated import with_deviations
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
-from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.measurements.report import MeasuredPath, Report
+from rayfix_service.fusion.measurements.selection import check_gains, has_gains, selections_of
 from rayfix_service.fusion.posterior.fixes import Product
 from rayfix_service.fusion.posterior.summary import GaussianPosterior
 from rayfix_service.fusion.product.beam import multiply
@@ -11,9 +14,11 @@ from rayfix_service.fusion.product.factors import Factor, make_factor
 from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_prior
 from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.quadrature.engine import Quadrature
+from rayfix_service.fusion.quadrature.sets import sort_paths
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
-from rayfix_tables.site import SiteInfo
+from rayfix_tables.errors import ReportError
+from rayfix_tables.site import REACH_DB, Selection, SiteInfo
 from rayfix_tables.table import Table
 
 _MOST_MEASUREMENTS = 32
@@ -34,6 +39,21 @@ _FEWER_HYPOTHESES = (
 )
 
 _COARSER_GRID = "the position's surroundings were divided less finely, since there were too many parts"
+
+_OWN_RULE = (
+    "the selection rule of {} was not followed but that of the table, since times on a clock of unknown offset are "
+    "located with the table's Gaussians; send paths with toa_m, or times on a known clock"
+)
+
+_BESIDE_PATHS = (
+    "the report has times of arrival or time differences (toa, tdoa) beside paths; give these times as paths with "
+    "toa_m, or with delay_ns"
+)
+
+_NO_GAINS = (
+    "the table has no gains of the paths of station '{}', which paths are located by; build the table again with this "
+    "version, or send aoa and pt of one path"
+)
 
 _SINGULAR = (
     "{} Gaussians were left out, since rounding made their covariances singular; give standard deviations that differ "
@@ -66,7 +86,12 @@ class Fusion:
         The estimate separates quick fixes from slow ones; it is infinite for a report that is slow in any case.
         """
         report = with_deviations(report, self.table.site)
-        seconds = self._quadrature.seconds(report) if len(report.measurements) <= _MOST_MEASUREMENTS else None
+        if any(isinstance(measurement, MeasuredPath) for measurement in report.measurements):
+            return self._quadrature.seconds_of_paths(len(report.measurements))
+        selections = selections_of(report, self.table.site)
+        seconds = (
+            self._quadrature.seconds(report, selections) if len(report.measurements) <= _MOST_MEASUREMENTS else None
+        )
         return self._cost.seconds(report) if seconds is None else seconds
 
     def product(
@@ -92,11 +117,20 @@ class Fusion:
             When it was stopped.
         """
         site = site or self.table.site
-        sorted_report = sort_report(with_deviations(report, site), site)
+        report = with_deviations(report, site)
+        sorted_report = sort_report(report, site)
         prior = self._prior(report)
-        if on_path_map and self._quadrature.suits(sorted_report):
-            return self._integrated(sorted_report, prior, stop)
-        return self._multiplied(sorted_report, prior, stop)
+        selections = selections_of(report, site)
+        check_gains(selections, self.table)
+        measured = [(n, m) for n, m in enumerate(report.measurements) if isinstance(m, MeasuredPath)]
+        if measured:
+            return self._several(sorted_report, measured, site, prior, stop, selections, report.selection)
+        if on_path_map and self._quadrature.suits(sorted_report, selections):
+            return self._integrated(sorted_report, prior, stop, selections)
+        product = self._multiplied(sorted_report, prior, stop)
+        if selections:
+            product = product._replace(simplified=(*product.simplified, _OWN_RULE.format(", ".join(selections))))
+        return product
 
     def _prior(self, report: Report) -> Prior:
         prior = self._uniform_prior
@@ -105,12 +139,40 @@ class Fusion:
             prior = height_prior(report.height, scene.free_space).raised(-float(scene.origin[2]))
         return prior
 
-    def _integrated(self, sorted_report: SortedReport, prior: Prior, stop: Stop) -> Product:
+    def _integrated(
+        self, sorted_report: SortedReport, prior: Prior, stop: Stop, selections: Mapping[str, Selection]
+    ) -> Product:
         """Integrate the posterior on the path map."""
         observations = list(sorted_report.observations)
-        posterior = self._quadrature.posterior(observations, prior, stop)
+        posterior = self._quadrature.posterior(observations, prior, stop, selections)
         simplified = (_COARSER_GRID,) if posterior.omitted else ()
         return Product(observations, dict(sorted_report.unused), prior, posterior, simplified)
+
+    def _several(
+        self,
+        sorted_report: SortedReport,
+        measured: Sequence[tuple[int, MeasuredPath]],
+        site: SiteInfo,
+        prior: Prior,
+        stop: Stop,
+        selections: Mapping[str, Selection],
+        selection: Selection | None,
+    ) -> Product:
+        """Integrate the posterior of a report with several paths of a station, and of what else it has."""
+        if sorted_report.num_clocks:
+            raise ReportError(_BESIDE_PATHS, path=("measurements",))
+        for index, path in measured:
+            if not has_gains(self.table, path.station_id):
+                raise ReportError(_NO_GAINS.format(path.station_id), path=("measurements", index))
+        within = selection.reach_db if selection is not None and selection.rule == "all" else REACH_DB["all"]
+        paths = sort_paths(measured, site, within_db=within, spurious_paths=self.settings.spurious_paths)
+        observations = list(sorted_report.observations)
+        unused = dict(sorted_report.unused) | paths.unused
+        if not observations and not paths.indices:
+            return Product([], unused, prior, None)
+        posterior = self._quadrature.posterior(observations, prior, stop, selections, paths)
+        observations += [Observation(station_id=name, angle_index=index) for name, index in paths.indices]
+        return Product(observations, unused, prior, posterior, (_COARSER_GRID,) if posterior.omitted else ())
 
     def _multiplied(self, sorted_report: SortedReport, prior: Prior, stop: Stop) -> Product:
         """Multiply the Gaussians of the table's cells."""

@@ -16,6 +16,8 @@ class FusionSettings:
     ----------
     outlier_probability : float
         Prior probability that a measurement has nothing to do with the position.
+    spurious_paths : float
+        Paths that a station that reports several is expected to report although there are none.
     sight_error : float
         Least probability that a receiver's line-of-sight indication is wrong, whatever the indication is.
     beam_width : int
@@ -54,6 +56,7 @@ class FusionSettings:
     """
 
     outlier_probability: Probability = 0.01
+    spurious_paths: Annotated[float, Limits(above=0.0, most=100.0)] = 0.3
     sight_error: Annotated[float, Limits(above=0.0, most=0.5)] = 0.05
     beam_width: Annotated[int, Limits(least=1, most=1_000_000)] = 2048
     most_alternatives: Annotated[int, Limits(least=1)] = 8192

@@ -1,7 +1,8 @@
-"""The path length of a path in a measured channel impulse response."""
+"""Path lengths of paths in a measured channel impulse response."""
 
 import math
-from typing import Literal
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,10 @@ _OVERSAMPLING = 4
 """Samples between two taps at which the response is evaluated before its maximum is refined."""
 
 _NOISE_MARGIN = 4.0
-"""A first path exceeds the noise by at least this many of its standard deviations."""
+"""A path exceeds the noise by at least this many of its standard deviations."""
+
+_MOST_RANGE_DB = 30.0
+"""Side lobes of a Hann window are weaker."""
 
 
 def range_from_impulse_response(
@@ -64,6 +68,156 @@ def range_from_impulse_response(
     To first order an error of the maximum is ``-Re(n' conj(g)) / Re(g'' conj(g))`` with the windowed response g and its
     noise n; without a window its variance is the Cramer-Rao bound ``1 / (8 pi^2 SNR B^2 / 12)``.
     """
+    response = _Response.of(taps, sampling_rate, bandwidth, noise_power, windowed=path == "first")
+    times, power = response.sampled()
+    start = int(np.argmax(power))
+    if path == "first":
+        found = response.peaks(power, dynamic_range_db)
+        start = int(found[0]) if len(found) else start
+    delay, variance, _ = response.refined(float(times[start]))
+    return RangeEstimate(
+        path_length=SPEED_OF_LIGHT * (first_tap_delay + delay), stdev=SPEED_OF_LIGHT * math.sqrt(variance)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathEstimate:
+    """A path of an impulse response.
+
+    Attributes
+    ----------
+    path_length, stdev : float, m
+    power_db : float
+        Power in the unit of the taps' squares, dB.
+    """
+
+    path_length: float
+    stdev: float
+    power_db: float
+
+
+def paths_from_impulse_response(
+    taps: ArrayLike,
+    *,
+    sampling_rate: float,
+    bandwidth: float | None = None,
+    noise_power: float | None = None,
+    dynamic_range_db: float = 20.0,
+    first_tap_delay: float = 0.0,
+    most: int = 16,
+) -> tuple[PathEstimate, ...]:
+    """Path lengths of all paths that a channel impulse response shows, in the order of arrival.
+
+    The paths are the maxima of the interpolated magnitude that exceed the noise by four of its standard deviations,
+    with a Hann window over the band, whose side lobes are at -31 dB.
+
+    Parameters
+    ----------
+    taps, sampling_rate, bandwidth, noise_power, first_tap_delay
+        As of :func:`range_from_impulse_response`.
+    dynamic_range_db : float
+        Paths are at most this much weaker than the strongest; at most 30, where side lobes begin.
+    most : int
+        Paths that are returned, the strongest.
+
+    Returns
+    -------
+    tuple of PathEstimate
+        At least the strongest path. Standard deviations are due to noise only, as of
+        :func:`range_from_impulse_response`; paths closer than about ``2 c / bandwidth`` are not told apart.
+
+    Raises
+    ------
+    ReportError
+        When the taps, the rates or the dynamic range are not valid.
+    """
+    if not 0.0 < dynamic_range_db <= _MOST_RANGE_DB:
+        raise ReportError(
+            f"dynamic_range_db is {dynamic_range_db}; give one above 0, and at most {_MOST_RANGE_DB:g}, where side "
+            "lobes begin"
+        )
+    if most < 1:
+        raise ReportError(f"most is {most}; give the number of paths that are wanted, at least 1")
+    response = _Response.of(taps, sampling_rate, bandwidth, noise_power, windowed=True)
+    times, power = response.sampled()
+    starts = response.peaks(power, dynamic_range_db)
+    if not len(starts):
+        starts = np.array([int(np.argmax(power))])
+    strongest = starts[np.argsort(-power[starts])[:most]]
+    found = [response.refined(float(times[start])) for start in np.sort(strongest)]
+    return tuple(
+        PathEstimate(
+            path_length=SPEED_OF_LIGHT * (first_tap_delay + delay),
+            stdev=SPEED_OF_LIGHT * math.sqrt(variance),
+            power_db=20.0 * math.log10(amplitude),
+        )
+        for delay, variance, amplitude in found
+    )
+
+
+class _Response(NamedTuple):
+    """A windowed response as a spectrum.
+
+    Attributes
+    ----------
+    spectrum : ndarray of shape (n,), complex
+    omega : ndarray of shape (n,), rad/s
+    window : ndarray of shape (n,)
+    band_size : int
+        Frequencies in the band.
+    noise_power : float
+        Of a tap.
+    step : float, s
+        Between the times at which it is sampled.
+    """
+
+    spectrum: NDArray[np.complex128]
+    omega: NDArray[np.float64]
+    window: NDArray[np.float64]
+    band_size: int
+    noise_power: float
+    step: float
+
+    @classmethod
+    def of(
+        cls,
+        taps: ArrayLike,
+        sampling_rate: float,
+        bandwidth: float | None,
+        noise_power: float | None,
+        *,
+        windowed: bool,
+    ) -> "_Response":
+        """Check what was given, and transform the taps."""
+        return _transformed(taps, sampling_rate, bandwidth, noise_power, windowed=windowed)
+
+    def sampled(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Sample the power, from one tap before the first, where noise may shift a path; give times, s, and power."""
+        times = self.step * np.arange(-_OVERSAMPLING, _OVERSAMPLING * (len(self.omega) - 1))
+        power = np.abs(np.exp(1j * np.outer(times, self.omega)) @ self.spectrum) ** 2
+        return np.asarray(times, np.float64), np.asarray(power, np.float64)
+
+    def peaks(self, power: NDArray[np.float64], dynamic_range_db: float) -> NDArray[np.int64]:
+        """Maxima of the sampled power that are above the noise and not too weak."""
+        noise = self.noise_power * float((self.window**2).sum()) / self.band_size
+        least = max(_NOISE_MARGIN**2 * noise, float(power.max()) * 10.0 ** (-0.1 * dynamic_range_db))
+        above = (power[1:-1] >= least) & (power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])
+        return np.flatnonzero(above) + 1
+
+    def refined(self, start: float) -> tuple[float, float, float]:
+        """Delay of the maximum next to a time, s, its variance, s2, and the path's amplitude in units of the taps."""
+        delay = _maximum(self.spectrum, self.omega, start, self.step)
+        total = float(self.window.sum())
+        amplitude = abs(np.exp(1j * self.omega * delay) @ self.spectrum) / total
+        noise_per_bin = self.noise_power / self.band_size
+        bend = float((self.window * self.omega**2).sum())
+        variance = 0.5 * noise_per_bin * float((self.window**2 * self.omega**2).sum()) / (amplitude * bend) ** 2
+        return delay, variance, float(amplitude) * total
+
+
+def _transformed(
+    taps: ArrayLike, sampling_rate: float, bandwidth: float | None, noise_power: float | None, *, windowed: bool
+) -> _Response:
     values = _checked_taps(taps)
     if not (math.isfinite(sampling_rate) and sampling_rate > 0.0):
         raise ReportError(f"sampling_rate is {sampling_rate}; give a positive rate in hertz")
@@ -80,26 +234,14 @@ def range_from_impulse_response(
     count = len(values)
     frequency = np.fft.fftfreq(count, 1.0 / sampling_rate)
     band = np.abs(frequency) <= 0.5 * bandwidth
-    window = band * (1.0 if path == "strongest" else 0.5 + 0.5 * np.cos(2.0 * np.pi * frequency / bandwidth))
-    spectrum, omega = window * np.fft.fft(values) / count, np.asarray(2.0 * np.pi * frequency, np.float64)
-    step = 1.0 / (sampling_rate * _OVERSAMPLING)
-    # The search begins one tap before the first, where noise may shift a path.
-    times = step * np.arange(-_OVERSAMPLING, _OVERSAMPLING * (count - 1))
-    power = np.abs(np.exp(1j * np.outer(times, omega)) @ spectrum) ** 2
-    start = int(np.argmax(power))
-    if path == "first":
-        noise = noise_power * float((window**2).sum()) / np.count_nonzero(band)
-        least = max(_NOISE_MARGIN**2 * noise, float(power[start]) * 10.0 ** (-0.1 * dynamic_range_db))
-        above = (power[1:-1] >= least) & (power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])
-        start = int(np.flatnonzero(above)[0]) + 1 if above.any() else start
-    delay = _maximum(spectrum, omega, float(times[start]), step)
-    # Noise at one frequency, and the path's amplitude there; both in units of the taps.
-    noise_per_bin = noise_power / np.count_nonzero(band)
-    amplitude = abs(np.exp(1j * omega * delay) @ spectrum) / float(window.sum())
-    bend = float((window * omega**2).sum())
-    variance = 0.5 * noise_per_bin * float((window**2 * omega**2).sum()) / (amplitude * bend) ** 2
-    return RangeEstimate(
-        path_length=SPEED_OF_LIGHT * (first_tap_delay + delay), stdev=SPEED_OF_LIGHT * math.sqrt(variance)
+    window = band * (0.5 + 0.5 * np.cos(2.0 * np.pi * frequency / bandwidth) if windowed else 1.0)
+    return _Response(
+        spectrum=window * np.fft.fft(values) / count,
+        omega=np.asarray(2.0 * np.pi * frequency, np.float64),
+        window=window,
+        band_size=int(np.count_nonzero(band)),
+        noise_power=noise_power,
+        step=1.0 / (sampling_rate * _OVERSAMPLING),
     )
 
 

@@ -1,10 +1,22 @@
 """The request documents: what a report looks like as JSON."""
 
-from pydantic import ConfigDict, Field
+from typing import Self
+
+from pydantic import ConfigDict, Field, model_validator
 
 from rayfix_service.fusion.measurements.report import CONFIDENCE, Height
-from rayfix_service.wire.fields import Confidence, HeightM, HeightStdevM, Rfc3339, WireModel
+from rayfix_service.wire.fields import (
+    Confidence,
+    HeightM,
+    HeightStdevM,
+    Rfc3339,
+    SelectionExponent,
+    WireModel,
+    WithinDb,
+    misfit,
+)
 from rayfix_service.wire.measurements import MeasurementDocument
+from rayfix_tables.site import Rule, Selection
 
 MAX_MEASUREMENTS = 256
 """Measurements that one report may have."""
@@ -24,6 +36,31 @@ class HeightDocument(WireModel):
     def height(self) -> Height:
         """Convert."""
         return Height(z=self.z_m, stdev=self.stdev_m)
+
+
+class SelectionDocument(WireModel):
+    """Which of the paths that they hear the stations of a report reported."""
+
+    model_config = ConfigDict(title="Selection")
+
+    rule: Rule = Field(
+        description='one of "strongest", "first" (the earliest audible path), "any" (each audible path alike) and "all"'
+    )
+    exponent: SelectionExponent | None = None
+    within_db: WithinDb | None = None
+
+    @model_validator(mode="after")
+    def _exponent_of_strongest(self) -> Self:
+        if self.exponent is not None and self.rule != "strongest":
+            raise misfit("exponent", 'is of the rule "strongest"; leave it out')
+        if self.within_db is not None and self.rule == "strongest":
+            raise misfit("within_db", 'is not of the rule "strongest"; leave it out')
+        return self
+
+    def selection(self) -> Selection:
+        """Convert."""
+        exponent = Selection.exponent if self.exponent is None else self.exponent
+        return Selection(rule=self.rule, exponent=exponent, within_db=self.within_db)
 
 
 class ReportDocument(WireModel):
@@ -46,6 +83,11 @@ class ReportDocument(WireModel):
         default=None, description='an object such as {"z_m": 1.2, "stdev_m": 0.1}: the known height of the target'
     )
     confidence: Confidence = CONFIDENCE
+    selection: SelectionDocument | None = Field(
+        default=None,
+        description='an object such as {"rule": "first"}: which of their paths the stations report, if not by the '
+        "rule of the site",
+    )
     measurements: list[MeasurementDocument] = Field(
         strict=False,  # a tuple is as good, where the document comes from Python
         min_length=1,

@@ -112,5 +112,12 @@ LosProbability = Annotated[
     float, _number(0, 1, "the probability that the path is direct, in the receiver's judgement of the signal's shape")
 ]
 
+PowerDb = Annotated[float, _number(-300, 300, "a power in decibels, relative to anything common to the paths")]
+
+SelectionExponent = Annotated[float, _number(0, 20, "how much the strong paths are preferred")]
+WithinDb = Annotated[
+    float, _number(0.1, 100, "how much weaker than all paths together an audible one may be, in decibels")
+]
+
 TailShare = Annotated[float, _number(1e-3, 0.5, "the fraction of errors that are of the wide part")]
 TailScale = Annotated[float, _number(1.5, 20, "how many times wider the wide part is")]

@@ -44,6 +44,7 @@ from rayfix_service.wire.fields import (
     ZenithDeg,
     misfit,
 )
+from rayfix_service.wire.paths import PathDocument
 from rayfix_tables.geometry.angles import wrap_one
 
 
@@ -336,10 +337,16 @@ MEASUREMENT_DOCUMENTS: dict[str, type[WireModel]] = {
     "toa": TimeOfArrivalDocument,
     "tdoa": TimeDifferenceDocument,
     "rssi": SignalStrengthDocument,
+    "path": PathDocument,
 }
 """Model of each value that ``type`` takes."""
 
 MeasurementDocument = Annotated[
-    AngleDocument | RangeDocument | TimeOfArrivalDocument | TimeDifferenceDocument | SignalStrengthDocument,
+    AngleDocument
+    | RangeDocument
+    | TimeOfArrivalDocument
+    | TimeDifferenceDocument
+    | SignalStrengthDocument
+    | PathDocument,
     Field(discriminator="type"),
 ]

@@ -66,6 +66,7 @@ def parse_report(document: Mapping[str, Any] | bytes, *, limits: MessageLimits =
         measurements=tuple(m.measurement() for m in model.measurements),
         height=None if model.height is None else model.height.height(),
         confidence=model.confidence,
+        selection=None if model.selection is None else model.selection.selection(),
         target_id=model.target_id,
         timestamp=model.timestamp,
     )

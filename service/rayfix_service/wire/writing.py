@@ -8,6 +8,7 @@ from rayfix_service.fusion.measurements.report import (
     Angle,
     ErrorModel,
     LogRange,
+    MeasuredPath,
     Measurement,
     Range,
     Report,
@@ -15,9 +16,11 @@ from rayfix_service.fusion.measurements.report import (
     TimeOfArrival,
 )
 from rayfix_service.wire.fields import METRES_PER_NANOSECOND
+from rayfix_service.wire.paths import path_to_document
 from rayfix_service.wire.problems import FieldProblem, InvalidReportError
 from rayfix_service.wire.request import parse_report
 from rayfix_tables.geometry.angles import wrap_one
+from rayfix_tables.site import Selection
 
 
 def report_to_document(report: Report) -> dict[str, Any]:
@@ -41,15 +44,26 @@ def report_to_document(report: Report) -> dict[str, Any]:
         document["height"] = {"z_m": report.height.z, "stdev_m": report.height.stdev}
     if report.confidence != CONFIDENCE:
         document["confidence"] = report.confidence
+    if report.selection is not None:
+        document["selection"] = _selection(report.selection)
     document["measurements"] = [_measurement(measurement) for measurement in report.measurements]
     parse_report(document)
     return document
+
+
+def _selection(selection: Selection) -> dict[str, Any]:
+    if selection.rule == "strongest":
+        return {"rule": selection.rule, "exponent": selection.exponent}
+    within = {} if selection.within_db is None else {"within_db": selection.within_db}
+    return {"rule": selection.rule, **within}
 
 
 def _measurement(measurement: Measurement) -> dict[str, Any]:
     match measurement:
         case Angle():
             return _angle(measurement) | _line_of_sight(measurement)
+        case MeasuredPath():
+            return path_to_document(measurement)
         case LogRange():
             return _signal_strength(measurement)
         case TimeDifference():

@@ -14,13 +14,13 @@ from rayfix_tables.paths import PATH_FIELDS
 from rayfix_tables.site import NO_BIAS, Mounting, Station, StationBias
 
 FORMAT = "rayfix-table"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Version that is written."""
 
 TEXT_IN_HEAPS = 1
 """Oldest version that is also read: its texts are attributes of variable length, stored in a heap of the file."""
 
-READ_VERSIONS = (TEXT_IN_HEAPS, 2, FORMAT_VERSION)
+READ_VERSIONS = (TEXT_IN_HEAPS, 2, 3, FORMAT_VERSION)
 
 ARRAYS_VERSION = 1
 """Version of the meaning of a part's arrays. It is the same in all format versions, which permits reuse of parts."""
@@ -58,7 +58,7 @@ CELL_CHANGE: tuple[type[np.generic], int] = (np.float32, 1)
 
 
 PATH_DATASETS = PATH_FIELDS
-"""Type and number of axes of the datasets of a station's path map, which tables have since version 3."""
+"""Type and number of axes of the datasets of a station's path map: since version 3, those of gains since version 4."""
 
 
 def level_path(station_id: str, level: int) -> str:

@@ -111,6 +111,8 @@ NOT_IN_IDENTITY = {
     "offline.rays.launch._Limits.of": DEFINITION,
     "offline.rays.launch._Limits.straight": DEFINITION,
     "offline.rays.pathprior.wall_factors": DEFINITION,
+    "offline.rays.pathmap._LN10": DEFINITION,
+    "offline.rays.pathmap._DECIBELS": DEFINITION,
     "offline.fit.moments.SIZE": DEFINITION,
     "offline.fit.moments.NUM_SUMS": DEFINITION,
     "offline.fit.normalise._CHUNK": SAME_BITS,

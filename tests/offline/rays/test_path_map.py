@@ -107,6 +107,31 @@ def test_it_has_the_paths_of_the_image_method(rays: RaySet, segments: Segments, 
     assert compared > 60
 
 
+def test_gains_are_those_of_the_reflections_and_lit_is_the_share_of_the_voxel(
+    rays: RaySet, segments: Segments, room: NDArray[np.float64]
+) -> None:
+    """The image method's gain, times the square of the length, is what the interactions leave."""
+    paths = path_map(rays, segments)
+    lit = []
+    for place in even_places(room, 10):
+        truth, (length, heading, _) = true_paths(room, place), paths_at(paths, place)
+        voxel = np.floor((place - paths.origin) / paths.voxel_size).astype(int)
+        first = paths.offsets[np.ravel_multi_index(tuple(voxel), paths.shape)]
+        for n in range(len(truth)):
+            toward = direction(truth.azimuth[n], truth.zenith[n])
+            found = np.flatnonzero(
+                (np.abs(length - truth.path_length[n]) < 1e-9) & (np.abs(heading - toward).max(axis=1) < 1e-9)
+            )
+            if len(found):
+                expected = np.log(10.0) / 10.0 * truth.gain_db[n] + 2.0 * np.log(truth.path_length[n])
+                assert float(paths.log_gain[first + found[0]]) == pytest.approx(
+                    expected, abs=2e-3 * (1.0 + abs(expected))
+                )
+                lit.append(float(paths.lit[first + found[0]]))
+    assert len(lit) > 60
+    assert np.median(lit) > 0.95
+
+
 def test_weights_of_the_other_priors(rays: RaySet, segments: Segments, room: NDArray[np.float64]) -> None:
     """Uniform: any path counts in full. Paper: by the inverse square of its length."""
     uniform, paper = path_map(rays, segments, "uniform"), path_map(rays, segments, "paper")

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rayfix_service.adapters.nrppa import parse_nrppa
-from rayfix_service.fusion.measurements.report import Angle, Height, Range, TimeOfArrival
+from rayfix_service.fusion.measurements.report import Angle, Height, MeasuredPath, Range, TimeOfArrival
 from rayfix_service.wire import InvalidReportError, MalformedJsonError
 
 TC_M = 299_792_458 / (480_000 * 4096)  # m
@@ -227,13 +227,74 @@ def test_what_cannot_be_used_is_told(value: dict[str, Any], words: str):
 
 
 @pytest.mark.parametrize("paths", ["additionalPathList", "ExtendedAdditionalPathList"])
-def test_additional_paths_are_skipped_and_told(paths: str):
-    value = {"uLRTOAmeas": {"k0": 985025}, paths: [{"relativeTimeOfPath": {"k0": 8300}}]}
-    adapted = parse_nrppa(message(item({"uL-RTOA": value})))
+def test_additional_paths_count_from_the_first(paths: str):
+    """Value v of k1 is the middle of -8175 + 2 (v - 1) to -8175 + 2 v Tc: 4096 is 16 Tc."""
+    more = {"relativeTimeOfPath": {"k1": 4096}, "pathQuality": timing_quality(3, "m0dot1")}
+    value = {"uLRTOAmeas": {"k0": 985025}, paths: [more]}
+    adapted = parse_nrppa(message(item({"uL-RTOA": value}, timing_quality(5, "m0dot1"))))
+    first, second = adapted.report.measurements
+    assert isinstance(first, MeasuredPath)
+    assert isinstance(second, MeasuredPath)
+    assert first.clock == second.clock == "ue"
+    assert first.length == pytest.approx(0.5 * TC_M, abs=1e-9)
+    assert second.length - first.length == pytest.approx(16.0 * TC_M, abs=1e-9)
+    assert first.stdev == pytest.approx(math.hypot(0.5, TC_M / math.sqrt(12.0)))
+    assert second.stdev == pytest.approx(math.hypot(0.3, 2.0 * TC_M / math.sqrt(12.0)))
+    assert adapted.sources[1][-2:] == (paths, 0)
+    assert not adapted.skipped
+
+
+def test_paths_have_their_angles_and_powers():
+    """The TRP's only angle is of the first path."""
+    more = {
+        "relativeTimeOfPath": {"k0": 8300},
+        "multipleULAoA": {"multipleULAoA": [{"uL-AoA": aoa(1200, 950)}, {"uL-AoA": aoa(1300, 950)}]},
+        "pathPower": {"firstPathRSRPP": 70},
+    }
+    value = {"uLRTOAmeas": {"k0": 985025}, "ExtendedAdditionalPathList": [more]}
+    adapted = parse_nrppa(
+        message(
+            item({"uL-AngleOfArrival": aoa(450, 900)}, angle_quality(20, 30)),
+            item({"uL-RTOA": value}, **{"LoS-NLoSInformation": {"loS-NLoSIndicatorSoft": 3}}),
+        )
+    )
+    first, second = adapted.report.measurements
+    assert isinstance(first, MeasuredPath)
+    assert isinstance(second, MeasuredPath)
+    assert first.frame == second.frame == "north"
+    assert first.azimuth == pytest.approx(math.radians(45.05))
+    assert first.azimuth_stdev == pytest.approx(math.radians(math.hypot(2.0, 0.1 / math.sqrt(12.0))))
+    assert second.azimuth == pytest.approx(math.radians(120.05))
+    assert second.zenith == pytest.approx(math.radians(95.05))
+    assert (first.power_db, second.power_db) == (None, 70.0)
+    assert sorted(skip.path[-1] for skip in adapted.skipped) == ["LoS-NLoSInformation", "multipleULAoA"]
+
+
+def test_times_without_additional_paths_are_paths_beside_them():
+    """So that all are on one clock; ranges without additional paths stay ranges."""
+    several = {"uLRTOAmeas": {"k0": 985025}, "additionalPathList": [{"relativeTimeOfPath": {"k0": 8300}}]}
+    document = message(item({"uL-RTOA": several}))
+    document[RESPONSE].append({"tRP-ID": 8, "measurementResult": [item({"uL-RTOA": {"uLRTOAmeas": {"k0": 985100}}})]})
+    assert [type(m) for m in parse_nrppa(document).report.measurements] == [MeasuredPath] * 3
+
+
+def test_a_round_trip_has_its_paths_on_a_known_clock():
+    value = {"rxTxTimeDiff": {"k0": 985025}, "additionalPathList": [{"relativeTimeOfPath": {"k0": 8176}}]}
+    ue = [{"tRP-ID": 7, "nr-UE-RxTxTimeDiff-r16": {"k0-r16": 985125}}]
+    first, second = parse_nrppa(message(item({"gNB-RxTxTimeDiff": value}), ue_rx_tx=ue)).report.measurements
+    assert isinstance(first, MeasuredPath)
+    assert isinstance(second, MeasuredPath)
+    assert first.clock == "known"
+    assert first.length == pytest.approx(0.5 * (0.5 + 100.5) * TC_M, abs=1e-9)
+    assert second.length == pytest.approx(first.length + 0.5 * TC_M, abs=1e-9)
+
+
+@pytest.mark.parametrize("value", [0, 16351])
+def test_a_path_beyond_the_range_is_skipped(value: int):
+    several = {"uLRTOAmeas": {"k0": 985025}, "additionalPathList": [{"relativeTimeOfPath": {"k0": value}}]}
+    adapted = parse_nrppa(message(item({"uL-RTOA": several})))
     assert len(adapted.report.measurements) == 1
-    (skipped,) = adapted.skipped
-    assert skipped.path[-2:] == ("uL-RTOA", paths)
-    assert "MultipleULAoA" in skipped.reason
+    assert adapted.skipped[0].path[-1] == "relativeTimeOfPath"
 
 
 @pytest.mark.parametrize(

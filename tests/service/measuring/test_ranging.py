@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rayfix_service.measuring.impulse_response import range_from_impulse_response
+from rayfix_service.measuring.impulse_response import paths_from_impulse_response, range_from_impulse_response
 from rayfix_service.measuring.ranging import range_from_round_trip, range_from_rssi, range_from_times
 from rayfix_tables.errors import ReportError
 
@@ -96,6 +96,39 @@ def test_the_deviation_is_that_of_many_draws(path: Literal["strongest", "first"]
     if path == "strongest":
         bound = C * np.sqrt(12.0 * power / (8.0 * np.pi**2)) / bandwidth
         assert lengths.std() == pytest.approx(bound, rel=0.12)
+
+
+def test_all_paths_come_in_the_order_of_arrival() -> None:
+    """Four taps apart or more, where side lobes are below -31 dB of each other."""
+    delays, gains = [10.3e-8, 31.6e-8, 50.0e-8], [0.2 + 0.0j, 1.0j, -0.3 + 0.0j]
+    found = paths_from_impulse_response(response(delays, gains), sampling_rate=RATE, noise_power=1e-8)
+    assert [one.path_length for one in found] == pytest.approx([C * t for t in delays], abs=0.1)
+    assert np.diff([one.power_db for one in found]) == pytest.approx([14.0, -10.5], abs=0.3)  # dB: each disturbs others
+    strongest = paths_from_impulse_response(response(delays, gains), sampling_rate=RATE, noise_power=1e-8, most=2)
+    assert strongest == found[1:]
+    near = paths_from_impulse_response(
+        response(delays, gains), sampling_rate=RATE, noise_power=1e-8, dynamic_range_db=12.0, first_tap_delay=1e-8
+    )
+    assert [one.path_length for one in near] == pytest.approx([one.path_length + 1e-8 * C for one in found[1:]])
+
+
+def test_noise_is_hardly_ever_a_path() -> None:
+    """Of four deviations above it one sample in ten million is; the weak path's deviation is that of many draws."""
+    rng, power = np.random.default_rng(6), 10.0**-3.5
+    clean = response([20.37e-8, 60.0e-8], [1.0, 0.4])
+    found = [
+        paths_from_impulse_response(clean + noise(rng, 128, power), sampling_rate=RATE, noise_power=power)
+        for _ in range(200)
+    ]
+    assert all(len(paths) == 2 for paths in found)
+    lengths = np.array([paths[1].path_length for paths in found])
+    assert np.mean([paths[1].stdev for paths in found]) == pytest.approx(lengths.std(), rel=0.16)
+
+
+@pytest.mark.parametrize("options", [{"dynamic_range_db": 0.0}, {"dynamic_range_db": 31.0}, {"most": 0}])
+def test_bad_settings_of_paths_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(ReportError, match="give"):
+        paths_from_impulse_response(response([1e-8], [1.0]), sampling_rate=RATE, **options)  # type: ignore[arg-type]
 
 
 def test_the_noise_is_estimated_from_the_taps_between_the_paths() -> None:

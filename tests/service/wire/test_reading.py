@@ -209,8 +209,8 @@ def test_the_documented_measurements_are_taken():
         report = document if "measurements" in document else {"measurements": [document]}
         kinds |= {measurement["type"] for measurement in report["measurements"]}
         assert parse_report(report).measurements
-    assert kinds == {"aoa", "pt", "toa", "tdoa", "rssi"}
-    assert len(documented()) == 9
+    assert kinds == {"aoa", "pt", "toa", "tdoa", "rssi", "path"}
+    assert len(documented()) == 10
 
 
 @pytest.mark.parametrize("example", [*REPORT_EXAMPLES.values()], ids=[*REPORT_EXAMPLES])

@@ -16,6 +16,7 @@ from rayfix_service.fusion.measurements.report import (
     Angle,
     Height,
     LogRange,
+    MeasuredPath,
     Measurement,
     Range,
     TimeOfArrival,
@@ -99,7 +100,7 @@ Pattern = tuple[tuple[str, ...], float, Array, Array]
 
 def one_gaussian(measurement: Measurement, wide: bool) -> tuple[Measurement, float]:
     """Measurement of which the error is of the one Gaussian or of the other, and the log probability of that."""
-    assert not isinstance(measurement, LogRange)
+    assert not isinstance(measurement, LogRange | MeasuredPath)
     model = measurement.error_model
     scale, share = (model.tail_scale, model.tail_share) if wide else (1.0, 1.0 - model.tail_share)
     if isinstance(measurement, Angle):

@@ -52,6 +52,8 @@ def direct_paths(position: tuple[float, float, float], space: FreeSpace) -> Path
         images=np.array([position]),
         mirrors=np.eye(3)[None],
         num_reflections=np.zeros(1, np.int8),
+        log_gain=np.zeros(count, np.float16),
+        lit=np.ones(count, np.float16),
     )
 
 

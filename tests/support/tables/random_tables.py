@@ -44,6 +44,7 @@ def random_mixture(rng: np.random.Generator, count: int, *, walls: bool = False)
 def random_paths(rng: np.random.Generator, free_space: FreeSpace, *, walls: bool = False) -> PathMap:
     """Paths of no meaning to voxels of twice the size of the free space's."""
     shape = tuple((-(-np.array(free_space.free.shape) // 2)).tolist())
+    own = np.random.default_rng(2)  # what came later does not change the numbers of stored tables
     counts, num_sequences = rng.integers(0, 4, int(np.prod(shape))), 5
     return PathMap(
         origin=free_space.origin,
@@ -57,6 +58,8 @@ def random_paths(rng: np.random.Generator, free_space: FreeSpace, *, walls: bool
         images=rng.normal(size=(num_sequences, 3)),
         mirrors=rng.normal(size=(num_sequences, 3, 3)),
         num_reflections=rng.integers(0, 4, num_sequences).astype(np.int8),
+        log_gain=-own.random(int(counts.sum())).astype(np.float16),
+        lit=own.random(int(counts.sum())).astype(np.float16),
     )
 
 

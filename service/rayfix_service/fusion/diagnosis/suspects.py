@@ -3,6 +3,7 @@
 from rayfix_service.fusion.measurements.report import (
     Angle,
     LogRange,
+    MeasuredPath,
     Measurement,
     Range,
     Report,
@@ -48,6 +49,8 @@ def named(measurement: Measurement) -> str:
             kind = "the signal strength"
         case TimeOfArrival():
             kind = "the time of arrival"
+        case MeasuredPath():
+            kind = "the path"
         case TimeDifference(reference_station_id=reference):
             return f"the time difference of station '{measurement.station_id}' to '{reference}'"
     return f"{kind} of station '{measurement.station_id}'"

@@ -5,7 +5,15 @@ from bisect import bisect_right
 from dataclasses import replace
 from typing import NamedTuple
 
-from rayfix_service.fusion.measurements.report import Angle, ErrorModel, Measurement, Range, Report, TimeOfArrival
+from rayfix_service.fusion.measurements.report import (
+    Angle,
+    ErrorModel,
+    MeasuredPath,
+    Measurement,
+    Range,
+    Report,
+    TimeOfArrival,
+)
 from rayfix_tables.site import AngleBias, Deviations, Rows, SiteInfo
 
 _STEPS = 60
@@ -137,6 +145,12 @@ def _calibrated(measurement: Measurement, found: Deviations) -> Measurement:
                 correlation=0.0,
                 error_model=errors,
             )
+        case MeasuredPath():
+            angle = None if measurement.angle is None else _calibrated(measurement.angle, found)
+            if isinstance(angle, Angle):
+                measurement = replace(measurement, azimuth_stdev=angle.azimuth_stdev, zenith_stdev=angle.zenith_stdev)
+            if measurement.length is not None and found.range is not None:
+                measurement = replace(measurement, stdev=found.range)
         case Range() | TimeOfArrival() if found.range is not None:
             return replace(measurement, stdev=found.range, error_model=errors)
     return measurement

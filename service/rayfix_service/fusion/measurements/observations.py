@@ -31,6 +31,7 @@ from rayfix_service.fusion.measurements.line_of_sight import los_probability
 from rayfix_service.fusion.measurements.report import (
     Angle,
     LogRange,
+    MeasuredPath,
     Measurement,
     Range,
     Report,
@@ -128,6 +129,8 @@ def sort_report(report: Report, site: SiteInfo) -> SortedReport:
             draft = drafts[station.id] = _Draft(station=station)
         bias = station.bias
         match measurement:
+            case MeasuredPath():
+                pass  # the paths of a station are a set: see rayfix_service.fusion.quadrature.sets
             case Angle(error_model=model):
                 measured = to_scene(without_bias(measurement, station), station, site.north)
                 inside = in_field_of_view(station, measured)

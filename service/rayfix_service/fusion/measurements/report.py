@@ -6,6 +6,8 @@ The JSON of the HTTP interface is read into these by :mod:`rayfix_service.wire`.
 from dataclasses import dataclass, field
 from typing import Literal
 
+from rayfix_tables.site import Selection
+
 CONFIDENCE = 0.68
 """Probability with which accuracies hold where a report gives none."""
 
@@ -132,7 +134,54 @@ class TimeDifference:
     error_model: ErrorModel = GAUSSIAN
 
 
-Measurement = Angle | Range | LogRange | TimeOfArrival | TimeDifference
+PathClock = Literal["known", "ue", "station"]
+"""Clock of a measured path's length: a known one, the UE's of unknown offset, or from the station's first path on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredPath:
+    """One of several paths that a station reports: its direction, its length, or both.
+
+    Attributes
+    ----------
+    station_id : str
+    azimuth, azimuth_stdev, zenith, zenith_stdev, frame
+        As of :class:`Angle`; None where the direction, or its zenith, was not measured.
+    length, stdev : float, m
+        Path length, with the offset of the clock; None where it was not measured.
+    clock : {"known", "ue", "station"}
+        Clock of the length. The paths of a station are on one.
+    power_db : float, optional
+        Power relative to anything that is common to the station's paths.
+    """
+
+    station_id: str
+    azimuth: float | None = None
+    azimuth_stdev: float | None = None
+    zenith: float | None = None
+    zenith_stdev: float | None = None
+    frame: Frame = "scene"
+    length: float | None = None
+    stdev: float | None = None
+    clock: PathClock = "known"
+    power_db: float | None = None
+
+    @property
+    def angle(self) -> Angle | None:
+        """The direction as an angle of arrival."""
+        if self.azimuth is None or self.azimuth_stdev is None:
+            return None
+        return Angle(
+            station_id=self.station_id,
+            azimuth=self.azimuth,
+            azimuth_stdev=self.azimuth_stdev,
+            zenith=self.zenith,
+            zenith_stdev=self.zenith_stdev,
+            frame=self.frame,
+        )
+
+
+Measurement = Angle | Range | LogRange | TimeOfArrival | TimeDifference | MeasuredPath
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +192,8 @@ class Report:
     ----------
     confidence : float
         Probability, between 0 and 1, with which the accuracies in other systems' formats hold.
+    selection : Selection, optional
+        Rule by which the stations selected what they report; that of each station by default.
     """
 
     measurements: tuple[Measurement, ...]
@@ -150,3 +201,4 @@ class Report:
     confidence: float = CONFIDENCE
     target_id: str | None = None
     timestamp: str | None = None
+    selection: Selection | None = None

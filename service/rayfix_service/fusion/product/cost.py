@@ -153,7 +153,7 @@ class CostEstimate:
                     for name in edges[-1]:
                         paths[name].readings += 1
                         paths[name].combinations *= len(spreads(m.error_model))
-            if not isinstance(m, LogRange | TimeDifference) and m.los_probability is not None:
+            if isinstance(m, Angle | Range | TimeOfArrival) and m.los_probability is not None:
                 of.judged = True
         if edges:
             clocks += _num_parts(edges)

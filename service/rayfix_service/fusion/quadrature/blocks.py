@@ -118,12 +118,15 @@ class StationPaths:
     paths : PathMap
     tree : BlockTree
         Of the same free space.
+    of_voxels : BlockPaths, optional
+        Paths to the voxels of the map with other weights than it has.
     """
 
-    def __init__(self, paths: PathMap, tree: BlockTree) -> None:
+    def __init__(self, paths: PathMap, tree: BlockTree, of_voxels: BlockPaths | None = None) -> None:
         self.images, self.mirrors = _read_only(paths.images), _read_only(paths.mirrors)
         self.num_reflections = _read_only(paths.num_reflections)
-        of_voxels = BlockPaths(paths.offsets, paths.sequence, paths.weight, paths.excess, paths.num_walls)
+        if of_voxels is None:
+            of_voxels = BlockPaths(paths.offsets, paths.sequence, paths.weight, paths.excess, paths.num_walls)
         self.levels = [_only_read(of_voxels)]
         for finer, coarser in zip(tree.levels, tree.levels[1:], strict=False):
             joined = _joined(*self.levels[-1], np.array(finer.shape), finer.volume, np.array(coarser.shape))

@@ -1,6 +1,6 @@
 """Locate reports whose errors are wide on the path map."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,10 +16,13 @@ from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.quadrature.blocks import BlockTree, StationPaths
 from rayfix_service.fusion.quadrature.grid import GridLimits, Leaves, integrate
 from rayfix_service.fusion.quadrature.observed import path_factor
+from rayfix_service.fusion.quadrature.reweighted import Reweighted
+from rayfix_service.fusion.quadrature.sets import NO_SETS, PathSets, SortedPaths, StationSet
 from rayfix_service.fusion.quadrature.summary import sum_up_leaves
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.site import Selection
 from rayfix_tables.table import Table
 
 _FINEST_LENGTH = 0.05
@@ -29,11 +32,20 @@ _WIDER_THAN = 1.28
 """Angles are wide from this many deviations of the finest window on; a sum of its cells answers narrower ones."""
 
 
+NO_SELECTIONS: Mapping[str, Selection] = {}
+"""Of stations whose rules are the table's."""
+
+_LEAST_RULES = 4
+"""Rules of single stations whose weights are kept at least; twice the number of stations where that is more."""
+
 _LEAST_SECONDS = 1e-3
 """What any fix takes, s."""
 
 _FACTOR_SECONDS = 6e-4
 """What each measurement takes, s."""
+
+_SETS_SECONDS, _PATH_SECONDS = 1.5e-2, 2e-3
+"""What a report of several paths of a station takes, and each of them, s."""
 
 _POSITION = 3
 """Coordinates of a position: more measured numbers than that leave nothing open."""
@@ -95,21 +107,33 @@ class Quadrature:
         self._limits = GridLimits()
         self._tree: BlockTree | None = None
         self._stations: dict[str, StationPaths] = {}
+        self._reweighted = Reweighted(most=max(_LEAST_RULES, 2 * len(table.parts)))
 
-    def suits(self, report: SortedReport) -> bool:
-        """Whether a report is to be located here: all of its errors are wide, and no clock is unknown."""
+    def suits(self, report: SortedReport, selections: Mapping[str, Selection] = NO_SELECTIONS) -> bool:
+        """Whether a report is to be located here, where no clock is unknown.
+
+        All of its errors are wide, or a station's rule is not the table's, which cells of Gaussians cannot follow.
+        """
         observations = report.observations
-        return bool(observations) and report.num_clocks == 0 and all(map(self._is_wide, observations))
+        if not observations or report.num_clocks:
+            return False
+        if selections:
+            return all(self._has_paths(each.station_id) for each in observations)
+        return all(map(self._is_wide, observations))
+
+    def _has_paths(self, name: str) -> bool:
+        paths = self._table.parts[name].paths
+        return paths is not None and len(paths) > 0
 
     def _is_wide(self, observation: Observation) -> bool:
-        part = self._table.parts[observation.station_id]
-        if part.paths is None or not len(part.paths):
+        if not self._has_paths(observation.station_id):
             return False
+        part = self._table.parts[observation.station_id]
         if any(term.variance < _FINEST_LENGTH**2 for terms in observation.lengths for term in terms):
             return False
         return _narrowest(observation) > _WIDER_THAN * part.levels[0].window
 
-    def seconds(self, report: Report) -> float | None:
+    def seconds(self, report: Report, selections: Mapping[str, Selection] = NO_SELECTIONS) -> float | None:
         """Estimate how long a fix will take here, s; None for a report that Gaussians answer.
 
         A report that leaves the position open along a line or a surface takes long, as does one of many combinations of
@@ -122,7 +146,7 @@ class Quadrature:
                 return None
             if isinstance(m, Angle):
                 stdevs = [m.azimuth_stdev] if m.zenith_stdev is None else [m.azimuth_stdev, m.zenith_stdev]
-                if min(stdevs) <= _WIDER_THAN * part.levels[0].window:
+                if not selections and min(stdevs) <= _WIDER_THAN * part.levels[0].window:
                     return None
                 known += len(stdevs)
                 combinations += len(spreads(m.error_model)) - 1
@@ -132,8 +156,27 @@ class Quadrature:
         slow = 1.0 if known > _POSITION else _OPEN
         return _LEAST_SECONDS + _FACTOR_SECONDS * len(report.measurements) * combinations * slow
 
-    def posterior(self, observations: Sequence[Observation], prior: Prior, stop: Stop = NEVER) -> GridPosterior:
+    @staticmethod
+    def seconds_of_paths(count: int) -> float:
+        """Estimate how long a fix of so many measurements takes of which some are of paths, s."""
+        return _SETS_SECONDS + _PATH_SECONDS * count
+
+    def posterior(
+        self,
+        observations: Sequence[Observation],
+        prior: Prior,
+        stop: Stop = NEVER,
+        selections: Mapping[str, Selection] = NO_SELECTIONS,
+        paths: SortedPaths | None = None,
+    ) -> GridPosterior:
         """Integrate the posterior of observations.
+
+        Parameters
+        ----------
+        selections : mapping of str to Selection
+            Rules of stations whose rule is not the table's.
+        paths : SortedPaths, optional
+            Measured paths of stations that report several.
 
         Raises
         ------
@@ -141,10 +184,22 @@ class Quadrature:
             When it was stopped.
         """
         factors = [path_factor(each, self._settings, self._table.site.max_path_length) for each in observations]
-        stations = [self._station(each.station_id) for each in observations]
-        leaves, omitted = integrate(self.tree, stations, factors, prior, self._limits, stop)
-        log_all_outlier = sum(float(np.log(factor.outlier)) for factor in factors)
+        stations = [self._station(each.station_id, selections.get(each.station_id)) for each in observations]
+        sets = NO_SETS if paths is None else self._sets(paths)
+        leaves, omitted = integrate(self.tree, stations, factors, prior, self._limits, stop, sets)
+        log_all_outlier = sum(float(np.log(factor.outlier)) for factor in factors) + sets.log_all_spurious
         return GridPosterior(leaves=leaves, log_all_outlier=log_all_outlier, omitted=omitted)
+
+    def _sets(self, paths: SortedPaths) -> PathSets:
+        groups = []
+        for group in paths.groups:
+            sets = []
+            for name, within_db, measured in group:
+                stored = self._table.parts[name].paths
+                assert stored is not None
+                sets.append(StationSet(self._reweighted.detected(name, stored, self.tree, within_db), measured))
+            groups.append(tuple(sets))
+        return PathSets(groups=tuple(groups))
 
     @property
     def tree(self) -> BlockTree:
@@ -155,7 +210,11 @@ class Quadrature:
             self._tree = BlockTree(space, max(1, round(paths.voxel_size / space.voxel_size)))
         return self._tree
 
-    def _station(self, name: str) -> StationPaths:
+    def _station(self, name: str, selection: Selection | None = None) -> StationPaths:
+        if selection is not None:
+            paths = self._table.parts[name].paths
+            assert paths is not None
+            return self._reweighted.selected(name, paths, self.tree, selection)
         found = self._stations.get(name)
         if found is None:
             paths = self._table.parts[name].paths

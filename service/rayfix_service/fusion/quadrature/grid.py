@@ -11,6 +11,7 @@ from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.quadrature.blocks import BlockPaths, BlockTree, StationPaths
 from rayfix_service.fusion.quadrature.factor import PathFactor, evaluate, expected_directions
 from rayfix_service.fusion.quadrature.layers import Layers, layers_of
+from rayfix_service.fusion.quadrature.sets import NO_SETS, PathSets
 from rayfix_service.fusion.stopping import NEVER, Stop
 
 _OCTANTS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
@@ -56,8 +57,9 @@ class Leaves(NamedTuple):
         Natural logarithm of the integral of prior times likelihood over the block.
     log_volume : ndarray of shape (n,), m3
         Of the block's free part.
-    late, lost : ndarray of shape (n, n_factors)
-        Probability that a factor's times are outliers and its angle is not, and that all of it is.
+    late, lost : ndarray of shape (n, n_factors + n_measured)
+        Probability that a factor's times are outliers and its angle is not, and that all of it is; for the measured
+        paths of sets, after the factors, that they are spurious.
     """
 
     point: Array
@@ -87,6 +89,7 @@ def integrate(
     prior: Prior,
     limits: GridLimits,
     stop: Stop = NEVER,
+    sets: PathSets = NO_SETS,
 ) -> tuple[Leaves, bool]:
     """Integrate the posterior of factors.
 
@@ -101,6 +104,8 @@ def integrate(
     limits : GridLimits
     stop : Stop
         Ends it early.
+    sets : PathSets
+        Measured paths of stations that report several.
 
     Returns
     -------
@@ -118,7 +123,7 @@ def integrate(
         for each, factor in zip(stations, factors, strict=True)
     ]
     # Several stations tell of a direction together; half of them, since each tells of two out of three.
-    resolution = limits.resolution / max(1.0, 0.5 * len(factors))
+    resolution = limits.resolution / max(1.0, 0.5 * (len(factors) + len(sets)))
     halvings = 1 - len(tree.levels)
     front = _largest(tree)
     done: list[Leaves] = []
@@ -130,8 +135,10 @@ def integrate(
         count = len(front.block)
 
         def at(points: Array, front: _Front = front, width: float = width, halvings: int = halvings) -> _Evaluated:
-            levels = [station.levels[max(-halvings, 0)] for station in stations]
-            return _evaluated(points, front.block, width**2 / 12.0, resolution, levels, geometries, factors)
+            level = max(-halvings, 0)
+            levels = [station.levels[level] for station in stations]
+            found = _evaluated(points, front.block, width**2 / 12.0, resolution, levels, geometries, factors)
+            return _with_sets(found, sets, points, front.block, width**2 / 12.0, resolution, level) if sets else found
 
         log_volume = np.log(front.volume)
         if layers.keep is None:
@@ -196,6 +203,22 @@ def _evaluated(
         np.add(found.log_likelihood, np.log(density), out=found.log_likelihood)
         np.add(found.information, told, out=found.information)
     return found
+
+
+def _with_sets(
+    found: _Evaluated,
+    sets: PathSets,
+    points: Array,
+    blocks: NDArray[np.int64],
+    spread: float,
+    resolution: float,
+    level: int,
+) -> _Evaluated:
+    """Multiply by the likelihood of measured paths."""
+    lost = sets.evaluate(points, blocks, spread, resolution, level, found.log_likelihood, found.information)
+    return found._replace(
+        late=np.concatenate([found.late, np.zeros_like(lost)]), lost=np.concatenate([found.lost, lost])
+    )
 
 
 def _at_two_heights(point: Array, height: Array, at: Callable[[Array], _Evaluated]) -> tuple[Array, Array, _Evaluated]:

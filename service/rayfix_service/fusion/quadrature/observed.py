@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rayfix_service.fusion.measurements.directions import Direction, MeasuredAngles
 from rayfix_service.fusion.measurements.line_of_sight import LineOfSightWeights, line_of_sight_weights
@@ -26,16 +27,12 @@ def path_factor(observation: Observation, settings: FusionSettings, max_path_len
     kinds, _, log_outlier = kinds_of(observation, settings.outlier_probability, max_path_length)
     indicated = observation.los_probability
     weights = _NO_INDICATION if indicated is None else line_of_sight_weights(indicated, settings.sight_error)
-    angles = _angles(observation.direction)
-    azimuth = 0.0 if angles is None else angles.azimuth
-    to_measured = _about_z(-azimuth) @ (_SCENE if angles is None else angles.to_scene.T)
-    zenith = math.nan if angles is None or angles.zenith is None else angles.zenith
-    cov = observation.direction.cov if angles is None else angles.cov
+    turn, zenith, cov = measured_direction(observation.direction)
     log_good = math.log1p(-settings.outlier_probability)
     return PathFactor(
-        turn=np.ascontiguousarray(to_measured),
+        turn=turn,
         zenith=zenith,
-        cov=np.array([cov[0, 0], cov[0, 1], cov[1, 1]]),
+        cov=cov,
         spreads=np.array([[math.exp(log_good + each.log_weight), each.scale] for each in observation.angle_spreads]),
         kinds=np.array(
             [[kind.outlier, math.exp(kind.log_weight), kind.length, kind.length_variance] for kind in kinds]
@@ -44,6 +41,16 @@ def path_factor(observation: Observation, settings: FusionSettings, max_path_len
         reflected=math.exp(weights.log_reflected),
         outlier=math.exp(log_outlier),
     )
+
+
+def measured_direction(direction: Direction) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
+    """Return ``turn``, ``zenith`` and ``cov`` of :class:`.factor.PathFactor` for a direction, or for none."""
+    angles = _angles(direction)
+    azimuth = 0.0 if angles is None else angles.azimuth
+    to_measured = _about_z(-azimuth) @ (_SCENE if angles is None else angles.to_scene.T)
+    zenith = math.nan if angles is None or angles.zenith is None else angles.zenith
+    cov = direction.cov if angles is None else angles.cov
+    return np.ascontiguousarray(to_measured), zenith, np.array([cov[0, 0], cov[0, 1], cov[1, 1]])
 
 
 def _angles(direction: Direction) -> MeasuredAngles | None:

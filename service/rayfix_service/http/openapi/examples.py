@@ -54,6 +54,22 @@ REPORT_EXAMPLES: dict[str, dict[str, Any]] = {
             ]
         },
     },
+    "several_paths": {
+        "summary": "Two paths of one station, on the UE's clock",
+        "value": {
+            "measurements": [
+                {**_AOA_1, "type": "path", "toa_m": 132.8, "stdev_m": 0.3, "power_db": -61.0},
+                {**_aoa("bs1", 36.2, 95.5), "type": "path", "toa_m": 133.9, "stdev_m": 0.3, "power_db": -67.5},
+            ]
+        },
+    },
+    "selection": {
+        "summary": "A station that reports the first path to arrive",
+        "value": {
+            "selection": {"rule": "first"},
+            "measurements": [_AOA_1, {"type": "pt", "station_id": "bs1", "range_m": 7.8, "stdev_m": 0.5}],
+        },
+    },
     "unsynchronised_clock": {
         "summary": "Angles, and times of arrival with a common unknown clock offset",
         "value": {

@@ -1,0 +1,129 @@
+"""Selection-aware reweighting: the weights of a station's paths under any rule by which it selects what it reports.
+
+The path map has the gain of each path and the share of a voxel that it reaches, so that a rule is a set of weights that
+is worked out once per station. With gains g_k, shares lit_k and lengths L_k of the paths to a voxel:
+
+    strongest   w_k = lit_k g_k^beta / sum_j lit_j g_j^beta
+    audible     p_k = lit_k / (1 + exp(-(g_k / sum_j lit_j g_j in dB + within) / edge))
+    first       w_k = p_k prod_{L_j < L_k} (1 - p_j)
+    any, all    w_k = p_k / sum_j p_j
+
+For a set of paths (:mod:`rayfix_service.fusion.quadrature.path_sets`) p_k is the probability that a path is reported.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rayfix_service.fusion.quadrature.blocks import BlockPaths
+from rayfix_tables.paths import PathMap
+from rayfix_tables.site import Selection
+
+_EDGE_DB = 1.7
+"""Scale of the logistic edge, which is as wide as 3 dB of fading and of losses that are not known make it."""
+
+_LEAST = 1e-4
+"""Lighter paths are left out."""
+
+_MOST_DETECTED = 0.95
+"""No path is surer to be reported: scenes are not drawn to the last object, and neighbouring paths interfere."""
+
+_FALL = 0.002
+"""By which fraction a path is less probable to be reported for each decibel that others are stronger."""
+
+_DB = 10.0 / math.log(10.0)
+
+Array = NDArray[np.float64]
+
+
+def detected_paths(paths: PathMap, within_db: float) -> BlockPaths:
+    """Paths to the voxels with the probability that a station reports each of them when it reports all.
+
+    Parameters
+    ----------
+    paths : PathMap
+        With gains.
+    within_db : float
+        A path is as likely as not to be reported that is so much weaker than all together.
+    """
+    voxel, gain, audible = _audible(paths, within_db)
+    below = _DB * (_highest(paths, gain)[voxel] - gain)
+    # Falls a little with the gain where it would be flat, so that the strongest paths come first.
+    return _sorted(paths, voxel, _MOST_DETECTED * audible * np.exp(-_FALL * below))
+
+
+def selected_paths(paths: PathMap, selection: Selection) -> BlockPaths:
+    """Paths to the voxels with their probability to be the one that a station reports.
+
+    Parameters
+    ----------
+    paths : PathMap
+        With gains.
+    selection : Selection
+    """
+    voxel, gain, audible = _audible(paths, selection.reach_db)
+    if selection.rule == "strongest":
+        highest = _highest(paths, gain)
+        weight = paths.lit.astype(np.float64) * np.exp(selection.exponent * (gain - highest[voxel]))
+    elif selection.rule == "first":
+        weight = audible * _none_before(paths, voxel, audible)
+    else:
+        weight = audible
+    total = np.bincount(voxel, weight, len(paths.offsets) - 1)
+    return _sorted(paths, voxel, weight / np.maximum(total, 1e-300)[voxel])
+
+
+def _audible(paths: PathMap, within_db: float) -> tuple[NDArray[np.int64], Array, Array]:
+    """Voxel of each path, the natural logarithm of its gain, and its probability to be audible."""
+    voxel = np.repeat(np.arange(len(paths.offsets) - 1), np.diff(paths.offsets))
+    gain = paths.log_gain.astype(np.float64) - 2.0 * np.log(_lengths(paths, voxel))
+    highest = _highest(paths, gain)
+    power = np.bincount(voxel, paths.lit * np.exp(gain - highest[voxel]), len(highest))
+    level = highest + np.log(np.maximum(power, 1e-300))
+    above = _DB * (gain - level[voxel]) + within_db
+    return voxel, gain, paths.lit / (1.0 + np.exp(np.clip(-above / _EDGE_DB, -50.0, 50.0)))
+
+
+def _lengths(paths: PathMap, voxel: NDArray[np.int64]) -> Array:
+    """Lengths of the paths to the middles of their voxels, m."""
+    middle = np.stack(np.unravel_index(voxel, paths.shape), axis=1) + 0.5
+    apart = paths.origin + paths.voxel_size * middle - paths.images[paths.sequence]
+    return np.asarray(np.maximum(np.linalg.norm(apart, axis=1), 0.5 * paths.voxel_size))
+
+
+def _highest(paths: PathMap, value: Array) -> Array:
+    """Highest value of the paths to each voxel, 0 where there is none."""
+    found = np.zeros(len(paths.offsets) - 1)
+    some = np.flatnonzero(np.diff(paths.offsets))
+    if len(some):
+        found[some] = np.maximum.reduceat(value, paths.offsets[some])
+    return found
+
+
+def _none_before(paths: PathMap, voxel: NDArray[np.int64], audible: Array) -> Array:
+    """Probability that no shorter path to the voxel is audible."""
+    length = _lengths(paths, voxel)
+    if len(paths.excess):
+        length += paths.excess
+    order = np.lexsort((length, voxel))
+    silent = np.log1p(-np.minimum(audible[order], 1.0 - 1e-9))
+    before = np.concatenate([[0.0], np.cumsum(silent)])
+    found = np.empty(len(order))
+    found[order] = np.exp(before[:-1] - before[paths.offsets[voxel[order]]])
+    return found
+
+
+def _sorted(paths: PathMap, voxel: NDArray[np.int64], weight: Array) -> BlockPaths:
+    """Paths of new weights, heaviest first."""
+    kept = np.flatnonzero(weight > _LEAST)
+    order = kept[np.lexsort((-weight[kept], voxel[kept]))]
+    counts = np.bincount(voxel[order], minlength=len(paths.offsets) - 1)
+    passes = len(paths.excess) > 0
+    return BlockPaths(
+        offsets=np.concatenate([[0], np.cumsum(counts)]),
+        sequence=paths.sequence[order],
+        weight=weight[order].astype(np.float32),
+        excess=paths.excess[order] if passes else np.zeros(0, np.float32),
+        num_walls=paths.num_walls[order] if passes else np.zeros(0, np.int8),
+    )
