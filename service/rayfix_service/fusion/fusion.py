@@ -2,15 +2,17 @@
 
 from rayfix_service.fusion.measurements.calibrated import with_deviations
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
-from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.measurements.report import Angle, Range, Report
 from rayfix_service.fusion.posterior.fixes import Product
+from rayfix_service.fusion.posterior.fused import StationFactor
 from rayfix_service.fusion.posterior.summary import GaussianPosterior
 from rayfix_service.fusion.product.beam import multiply
 from rayfix_service.fusion.product.cost import CostEstimate
 from rayfix_service.fusion.product.factors import Factor, make_factor
 from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_prior
 from rayfix_service.fusion.product.station_mixture import StationMixtures
-from rayfix_service.fusion.quadrature.engine import Quadrature
+from rayfix_service.fusion.quadrature.engine import GridPosterior, Quadrature
+from rayfix_service.fusion.quadrature.observed import path_factor
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.site import SiteInfo
@@ -97,6 +99,17 @@ class Fusion:
         if on_path_map and self._quadrature.suits(sorted_report):
             return self._integrated(sorted_report, prior, stop)
         return self._multiplied(sorted_report, prior, stop)
+
+    def station_factors(self, report: Report, product: Product) -> tuple[StationFactor, ...]:
+        """Give the observations of a report, as factors where it was integrated on the path map."""
+        exact = isinstance(product.posterior, GridPosterior) and all(
+            isinstance(each, Angle | Range) for each in report.measurements
+        )
+        longest = self.table.site.max_path_length
+        return tuple(
+            StationFactor(each.station_id, path_factor(each, self.settings, longest) if exact else None)
+            for each in product.observations
+        )
 
     def _prior(self, report: Report) -> Prior:
         prior = self._uniform_prior
