@@ -14,7 +14,8 @@ including the packages ``rayfix_*``, may change without notice. The names are
   ``RangeEstimate``, ``LogRangeEstimate`` and ``PathEstimate``;
 - the fusion and its answer: ``Locator``, ``FusionSettings``, ``Fix``, ``Status``, ``Candidate``, ``Outcome``,
   ``CredibleRegions``, ``Posterior``, ``Fused``; ``Stop`` ends a fix early, by ``FixStoppedError``;
-- tracks: ``Tracker``, ``TrackingSettings``, ``MotionModel``, ``TrackedPosition``, ``TrackState``, ``Estimate``;
+- tracks: ``Tracker``, ``TrackingSettings``, ``MotionModel``, ``DriftModel``, ``TrackedPosition``, ``TrackState``,
+  ``Estimate``;
 - a service over the network: ``Client``, ``AsyncClient``, ``RetryPolicy``;
 - the errors, drawn as a tree in :mod:`rayfix.errors`.
 
@@ -89,6 +90,7 @@ if TYPE_CHECKING:
     from rayfix_service.measuring.ranging import range_from_round_trip as range_from_round_trip
     from rayfix_service.measuring.ranging import range_from_rssi as range_from_rssi
     from rayfix_service.measuring.ranging import range_from_times as range_from_times
+    from rayfix_service.tracking.drift import DriftModel as DriftModel
     from rayfix_service.tracking.motion import MotionModel as MotionModel
     from rayfix_service.tracking.settings import TrackingSettings as TrackingSettings
     from rayfix_service.tracking.track import Estimate as Estimate
@@ -111,6 +113,7 @@ __all__ = [
     "ClientError",
     "CorruptTableError",
     "CredibleRegions",
+    "DriftModel",
     "ErrorModel",
     "Estimate",
     "Fix",
@@ -189,6 +192,7 @@ _LAZY = {
     ("rayfix_service.fusion.posterior.posterior", "service"): ("Posterior",),
     ("rayfix_service.fusion.posterior.fused", "service"): ("Fused",),
     ("rayfix_service.locator", "service"): ("Locator",),
+    ("rayfix_service.tracking.drift", "service"): ("DriftModel",),
     ("rayfix_service.tracking.motion", "service"): ("MotionModel",),
     ("rayfix_service.tracking.settings", "service"): ("TrackingSettings",),
     ("rayfix_service.tracking.track", "service"): ("Estimate", "TrackState", "TrackedPosition"),

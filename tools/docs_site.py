@@ -46,7 +46,7 @@ API = {
     "tracks": (
         "Tracks",
         "Targets that are followed from report to report.",
-        ("Tracker", "TrackingSettings", "MotionModel", "TrackedPosition", "TrackState", "Estimate"),
+        ("Tracker", "TrackingSettings", "MotionModel", "DriftModel", "TrackedPosition", "TrackState", "Estimate"),
     ),
     "client": ("Client", "A service over the network.", ("Client", "AsyncClient", "RetryPolicy")),
     "errors": (

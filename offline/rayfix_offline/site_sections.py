@@ -88,10 +88,12 @@ class DeviationsSection(Section):
     )
     tail_scale: Annotated[float, Field(ge=1, le=20)] = Field(default=1.0, description="how many times wider that is")
     correlation_s: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
-        default=None, description="time in which the correlated part of the errors of angles falls to 37 %"
+        default=None,
+        description="time in which the correlation of the errors' drift falls to 37 %; tracks take it into account",
     )
     correlated_share: Annotated[float, Field(ge=0, le=1)] | None = Field(
-        default=None, description="share of that part in the variance"
+        default=None,
+        description="share of the drift in the variance of the errors; without it tracks assume defaults",
     )
 
     def deviations(self) -> Deviations:
@@ -102,6 +104,8 @@ class DeviationsSection(Section):
             range=self.range_m,
             tail_share=self.tail_share,
             tail_scale=self.tail_scale,
+            correlation_time=self.correlation_s,
+            correlated_share=self.correlated_share,
         )
 
 

@@ -147,7 +147,8 @@ class Locator:
             likelihood = None
         elif report.height is not None:
             likelihood = self._fusion.product(replace(report, height=None), stop).hypotheses
-        return Fused(fix=fix, hypotheses=hypotheses, prior=product.prior, likelihood=likelihood)
+        factors = self._fusion.station_factors(report, product) if with_likelihood else ()
+        return Fused(fix=fix, hypotheses=hypotheses, prior=product.prior, likelihood=likelihood, factors=factors)
 
     def posterior(self, report: Report | Mapping[str, Any], *, stop: Stop = NEVER) -> Posterior:
         """Fuse the measurements of a report into the density of the UE's position, for pictures and samples.

@@ -51,6 +51,10 @@ class Deviations:
         Of times as lengths.
     tail_share, tail_scale : float
         Of heavy tails, as in an error model of a report; they go with the deviations.
+    correlation_time : float or None, s
+        Time in which the correlation of the errors' drift falls to 37 %.
+    correlated_share : float or None
+        Of the variance that belongs to the drift; None where the calibration did not tell.
     """
 
     azimuth: float | None = None
@@ -58,6 +62,8 @@ class Deviations:
     range: float | None = None
     tail_share: float = 0.0
     tail_scale: float = 1.0
+    correlation_time: float | None = None
+    correlated_share: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -81,7 +81,7 @@ def test_uwb(
     # The default beam loses fixes from ranges alone when one of them is wrong.
     arguments = ["--data", str(shared_data / "uwb"), "--reports", "3", "--windows", "15", "--beam", "1024"]
     arguments += ["--plot", str(picture)]
-    lines = run("fusion/uwb.py", capsys, monkeypatch, *arguments)
+    lines = run("recorded/uwb.py", capsys, monkeypatch, *arguments)
     rows = {line[:39].strip(): [float(v) for v in line[39:].split()[:6]] for line in lines[3:]}
     assert list(rows) == [
         "least squares",

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.fusion.uwb_recordings import ANCHORS, TAGS, least_squares, read_ranging, site_text
+from benchmarks.recorded.uwb_recordings import ANCHORS, TAGS, least_squares, read_ranging, site_text
 from rayfix_offline.site import read_site
 from rayfix_tables.errors import RayfixError
 

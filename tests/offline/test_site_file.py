@@ -288,3 +288,12 @@ def test_windows_paths(name: str, tmp_path: Path) -> None:
     assert "write Windows paths with / or in single quotes" in file_refused(tmp_path / "site.toml")
     (tmp_path / "site.toml").write_text(text.format(f"'{name}'"))
     assert read_site(tmp_path / "site.toml").site.scene == name
+
+
+def test_the_drift_of_a_stations_errors_is_read(site_document: Document) -> None:
+    document = site_document()
+    document["stations"][0]["deviations"] = {"correlation_s": 1.5, "correlated_share": 0.6}
+    found = parse_site(document).info().stations[0].deviations
+    assert found is not None
+    assert (found.correlation_time, found.correlated_share) == (1.5, 0.6)
+    assert found.azimuth is None

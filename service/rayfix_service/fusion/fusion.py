@@ -4,16 +4,18 @@ from collections.abc import Mapping, Sequence
 
 from rayfix_service.fusion.measurements.calibrated import with_deviations
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
-from rayfix_service.fusion.measurements.report import MeasuredPath, Report
+from rayfix_service.fusion.measurements.report import Angle, MeasuredPath, Range, Report
 from rayfix_service.fusion.measurements.selection import check_gains, has_gains, selections_of
 from rayfix_service.fusion.posterior.fixes import Product
+from rayfix_service.fusion.posterior.fused import StationFactor
 from rayfix_service.fusion.posterior.summary import GaussianPosterior
 from rayfix_service.fusion.product.beam import multiply
 from rayfix_service.fusion.product.cost import CostEstimate
 from rayfix_service.fusion.product.factors import Factor, make_factor
 from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_prior
 from rayfix_service.fusion.product.station_mixture import StationMixtures
-from rayfix_service.fusion.quadrature.engine import Quadrature
+from rayfix_service.fusion.quadrature.engine import GridPosterior, Quadrature
+from rayfix_service.fusion.quadrature.observed import path_factor
 from rayfix_service.fusion.quadrature.sets import sort_paths
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
@@ -131,6 +133,19 @@ class Fusion:
         if selections:
             product = product._replace(simplified=(*product.simplified, _OWN_RULE.format(", ".join(selections))))
         return product
+
+    def station_factors(self, report: Report, product: Product) -> tuple[StationFactor, ...]:
+        """Give the observations of a report, as factors where it was integrated on the path map."""
+        exact = (
+            isinstance(product.posterior, GridPosterior)
+            and all(isinstance(each, Angle | Range) for each in report.measurements)
+            and not selections_of(report, self.table.site)
+        )
+        longest = self.table.site.max_path_length
+        return tuple(
+            StationFactor(each.station_id, path_factor(each, self.settings, longest) if exact else None)
+            for each in product.observations
+        )
 
     def _prior(self, report: Report) -> Prior:
         prior = self._uniform_prior

@@ -58,7 +58,12 @@ class Likelihood:
 
 
 def likelihood_of(
-    hypotheses: Hypotheses, log_volume: float, *, height: Prior | None = None, height_share: float = 0.0
+    hypotheses: Hypotheses,
+    log_volume: float,
+    *,
+    height: Prior | None = None,
+    height_share: float = 0.0,
+    variance_factor: float = 1.0,
 ) -> Likelihood:
     """Turn the hypotheses of a report into a likelihood.
 
@@ -73,10 +78,15 @@ def likelihood_of(
         in full; see ``TrackingSettings.height_seconds``.
     height_share : float
         Fraction of that knowledge that counts, 0 to 1: its Gaussian is raised to this power, and is 1 at its mean.
+    variance_factor : float
+        By which the Gaussians are widened, since the errors are correlated with those of the report before.
     """
     information, definite = inverses(hypotheses.cov)
     information, mean, log_weight = information[definite], hypotheses.mean[definite], hypotheses.log_weight[definite]
     log_scale = log_weight + 0.5 * np.linalg.slogdet(information)[1] - 1.5 * LOG_2PI + log_volume
+    if variance_factor != 1.0:
+        information = information / variance_factor
+        log_scale -= 1.5 * np.log(variance_factor)
     log_scale = np.append(log_scale, hypotheses.log_all_outlier)
     mean = np.concatenate([mean, np.zeros((1, 3))])
     information = np.concatenate([information, np.zeros((1, 3, 3))])

@@ -105,3 +105,40 @@ def step_of(model: MotionModel, velocity_variance: Array, seconds: float) -> Ste
         gain=gain,
         velocity_variance=velocity_variance + density * seconds - gain * both,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bridge:
+    """Where a particle was on the way to a known end, at equal steps, along each axis.
+
+    Attributes
+    ----------
+    gain : ndarray of shape (3, k)
+        By which a place on the way follows the end's distance from its prediction.
+    root : ndarray of shape (3, k, k), m
+        Cholesky factors of the places' covariance about that.
+    """
+
+    gain: Array
+    root: Array
+
+
+def bridge_of(model: MotionModel, velocity_variance: Array, seconds: float, num_steps: int) -> Bridge:
+    """Condition the places between ``num_steps`` steps on the position at the end.
+
+    For times s <= t, with the variance V of the velocity, ``cov(x(s), x(t)) = s t V + q (s^2 t / 2 - s^3 / 6)``.
+
+    Parameters
+    ----------
+    velocity_variance : ndarray of shape (3,), m2 / s2
+        Before the first step.
+    seconds : float
+        Of all steps together.
+    """
+    times = seconds * np.arange(1, num_steps + 1) / num_steps
+    early, late = np.minimum(times[:, None], times), np.maximum(times[:, None], times)
+    cov = early * late * velocity_variance[:, None, None]
+    cov = cov + model.density[:, None, None] * (early**2 * late / 2.0 - early**3 / 6.0)
+    gain = cov[:, :-1, -1] / cov[:, -1:, -1]
+    left = cov[:, :-1, :-1] - gain[:, :, None] * cov[:, None, :-1, -1]
+    return Bridge(gain=gain, root=np.asarray(np.linalg.cholesky(left)))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.product.beam import Hypotheses
+from rayfix_service.tracking.drift import Drifts, joined
 from rayfix_service.tracking.likelihood import Likelihood
 from rayfix_service.tracking.motion import MotionModel, Step, step_of
 from rayfix_service.tracking.walls import Walls
@@ -41,11 +42,14 @@ class Particles:
         Means.
     velocity_variance : ndarray of shape (3,), m2 / s2
         Of each component about its mean, the same for all particles.
+    drifts : Drifts, optional
+        Of the stations' errors; None where these are taken for independent.
     """
 
     position: Array
     velocity: Array
     velocity_variance: Array
+    drifts: Drifts | None = None
 
     def __len__(self) -> int:
         """Return the number of particles."""
@@ -84,7 +88,7 @@ def birth(
     weight = np.where(definite, np.exp(hypotheses.log_weight - hypotheses.log_weight[definite].max()), 0.0)
     kept = np.empty((0, 3))
     for _ in range(_ROUNDS):
-        pick = _systematic(weight, count, rng)
+        pick = systematic(weight, count, rng)
         drawn = hypotheses.mean[pick] + np.einsum("nij,nj->ni", roots[pick], rng.standard_normal((count, 3)))
         kept = np.concatenate([kept, drawn[free_space.contains(drawn)]])
         if len(kept) >= count:
@@ -144,7 +148,7 @@ def update(
     roots = cholesky_factors(cov)[0]
 
     def draw(num_kept: int) -> tuple[NDArray[np.int64], Array]:
-        origin, chosen = np.divmod(_systematic(weight.ravel(), count, rng), alternatives)
+        origin, chosen = np.divmod(systematic(weight.ravel(), count, rng), alternatives)
         mean = middle[origin]
         pull = likelihood.slope[chosen] - np.einsum(
             "nij,nj->ni", likelihood.information[chosen], mean - likelihood.mean[chosen]
@@ -181,7 +185,15 @@ def mixed(track: Particles, newborn: Particles, share: float, rng: np.random.Gen
         position=np.concatenate([track.position[stay], newborn.position[come]]),
         velocity=np.concatenate([track.velocity[stay], drawn]),
         velocity_variance=track.velocity_variance,
+        drifts=_both(track.drifts, stay, newborn.drifts, come),
     )
+
+
+def _both(
+    track: Drifts | None, stay: NDArray[np.int64], newborn: Drifts | None, come: NDArray[np.int64]
+) -> Drifts | None:
+    """Drifts of the particles that stay and of those that come."""
+    return None if track is None or newborn is None else joined(track.those(stay), newborn.those(come))
 
 
 def _pair_evidences(middle: Array, step: Step, likelihood: Likelihood, cov: Array) -> Array:
@@ -262,10 +274,11 @@ def _moved(particles: Particles, step: Step, ways: _Ways, middle: Array) -> Part
         position=ways.end,
         velocity=particles.velocity[ways.origin] + step.gain * (ways.end - middle[ways.origin]),
         velocity_variance=step.velocity_variance,
+        drifts=None if particles.drifts is None else particles.drifts.those(ways.origin),
     )
 
 
-def _systematic(weight: Array, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def systematic(weight: Array, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Draw indices by weight with one random number (systematic resampling: J. Carpenter et al., 1999)."""
     reached = np.cumsum(weight)
     levels = (np.arange(count) + rng.random()) * (reached[-1] / count)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from rayfix_service.tracking.drift import DriftModel
 from rayfix_service.tracking.motion import MotionModel, Positive
 from rayfix_tables.validation.limits import Limits, check_limits
 
@@ -16,8 +17,10 @@ class TrackingSettings:
     Attributes
     ----------
     motion : MotionModel
+    drift : DriftModel or None
+        How the errors of stations hang together over time; None takes all errors for independent.
     num_particles : int
-        Of each target; a target takes some 50 bytes for each.
+        Of each target; a target takes some 50 bytes for each, and 24 more for each station that it was heard by.
     restart_probability : float
         Prior probability that a report has nothing to do with the track before it: the tag was carried through a door
         that the model does not have, or given to someone else.
@@ -41,6 +44,7 @@ class TrackingSettings:
     """
 
     motion: MotionModel = field(default_factory=MotionModel)
+    drift: DriftModel | None = field(default_factory=DriftModel)
     num_particles: Count = 512
     restart_probability: Annotated[float, Limits(above=0.0, below=1.0)] = 1e-4
     longest_gap: Positive = 5.0

@@ -5,6 +5,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from threading import Lock
 from time import monotonic
 
@@ -16,9 +17,13 @@ from rayfix_service.fusion.posterior.points import ListedPoints
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.prior import uniform_prior
 from rayfix_service.measuring.timestamps import utc_moment
+from rayfix_service.tracking.correlated import KnownHeight, update_drifting, with_drifts
+from rayfix_service.tracking.drift import no_drifts, variance_factor
 from rayfix_service.tracking.estimate import estimate
 from rayfix_service.tracking.likelihood import likelihood_of
-from rayfix_service.tracking.particles import Particles, birth, mixed, predict, update
+from rayfix_service.tracking.motion import MotionModel, step_of
+from rayfix_service.tracking.on_paths import Measured, Stations
+from rayfix_service.tracking.particles import Particles, Updated, birth, mixed, predict, update
 from rayfix_service.tracking.settings import TrackingSettings
 from rayfix_service.tracking.track import TrackedPosition, TrackState
 from rayfix_service.tracking.walls import walls_of
@@ -28,6 +33,13 @@ from rayfix_tables.table import Table
 
 _MOST_HYPOTHESES = 512
 """Of a report, the best are taken in: each meets all particles, and few reports have a quarter as many."""
+
+_LAST = 1.0
+"""Seconds before a report that errors that drift are followed over at once, rather than step by step.
+
+Known drifts make a report tell the way since the one before within centimetres, which a step without it would have to
+hit by chance: with reports a second apart, 74 % of the targets were in the 90 % circle, and are 89 % so.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,6 +94,9 @@ class Tracker:
         self._origin = scene.origin
         self.dropped = 0
         self._log_volume = uniform_prior(self._walls.free_space).log_volume
+        self._stations = None
+        if isinstance(table, Table) and self.settings.drift is not None:
+            self._stations = Stations(table, self.settings.drift)
         self._clock = clock
         self._tracks: OrderedDict[str, _Track] = OrderedDict()  # the one with the latest report comes last
         self._lock = Lock()
@@ -109,6 +124,10 @@ class Tracker:
         assert particles is not None
         likelihood = likelihood_of(hypotheses, self._log_volume)
         updated = update(particles, likelihood, settings.motion, 0.1, self._walls, rng)
+        if self._stations is not None and settings.drift is not None:
+            for measured in self._stations.examples():
+                particles = with_drifts(particles, measured, settings.drift, rng)
+                update_drifting(particles, measured, settings.motion, settings.drift, 0.1, 1, self._walls, rng)
         position = _tracked("started", "1970-01-01T00:00:00Z", 1, particles if updated is None else updated.particles)
         position.regions.upright_ellipsoid(0.5)
         _ = position.regions.accuracies(0.5).ellipsoid.semi_axes
@@ -188,41 +207,101 @@ class Tracker:
         if not fused.hypotheses:
             return None
         settings = self.settings
-        return birth(fused.hypotheses, self._walls.free_space, settings.motion, settings.num_particles, rng)
+        born = birth(fused.hypotheses, self._walls.free_space, settings.motion, settings.num_particles, rng)
+        if born is None or self._stations is None or settings.drift is None:
+            return born
+        measured = self._stations.measured(fused.factors)
+        if measured is None:
+            return replace(born, drifts=no_drifts(len(born), rng))
+        return with_drifts(born, measured, settings.drift, rng)
 
     def _go_on(self, track: _Track, timestamp: str, gap: float, fused: Fused, now: float) -> _Track | None:
         settings, rng = self.settings, track.rng
         num_steps = math.ceil(gap / settings.longest_step)
         step = gap / num_steps
         particles: Particles | None = track.particles
+        if particles is not None and particles.drifts is not None and settings.drift is not None:
+            particles = replace(particles, drifts=particles.drifts.aged(gap, settings.drift, rng))
         # The last step is the update, where the report constrains the position.
-        for _ in range(num_steps - 1 if fused.hypotheses else num_steps):
+        num_last = 1 if fused.hypotheses else 0
+        measured = self._stations.measured(fused.factors) if num_last and self._stations is not None else None
+        if measured is not None:
+            num_last = min(num_steps, max(1, math.floor(_LAST / step + 1e-9)))
+        for _ in range(num_steps - num_last):
             if particles is not None:
                 particles = predict(particles, settings.motion, step, self._walls, rng)
         state: TrackState = "predicted"
         if fused.hypotheses:
-            particles, state = self._take_in(particles, fused, step, min(1.0, gap / settings.height_seconds), rng)
+            update_with = partial(self._update, fused=fused, measured=measured, gap=gap, step=step, num_last=num_last)
+            particles, state = self._take_in(particles, fused, update_with, rng)
         if particles is None:
             return None
         num_reports = 1 if state == "restarted" else track.position.num_reports + (state == "updated")
         position = _tracked(state, timestamp, num_reports, particles).moved(self._origin)
         return _Track(particles=particles, position=position, seconds=track.seconds + gap, touched=now, rng=rng)
 
+    def _update(
+        self,
+        particles: Particles,
+        rng: np.random.Generator,
+        *,
+        fused: Fused,
+        measured: list[Measured] | None,
+        gap: float,
+        step: float,
+        num_last: int,
+    ) -> tuple[Updated | None, float]:
+        """Update particles over the last steps; also gives the log evidence of the report if it began a new track."""
+        assert fused.likelihood is not None
+        settings = self.settings
+        share = min(1.0, gap / settings.height_seconds)
+        if measured is not None and settings.drift is not None:
+            height = None
+            if fused.prior.precision > 0.0:
+                mean = fused.prior.eta / fused.prior.precision
+                height = KnownHeight(mean, share * fused.prior.precision)
+            found = update_drifting(
+                particles,
+                measured,
+                settings.motion,
+                settings.drift,
+                num_last * step,
+                num_last,
+                self._walls,
+                rng,
+                height=height,
+            )
+            return found, fused.fix.log_evidence
+        factor = 1.0
+        if self._stations is not None and settings.drift is not None:
+            heard = {each.station_id for each in fused.factors}
+            factor = variance_factor(
+                [self._stations.by_id[name] for name in sorted(heard)],
+                settings.drift,
+                gap,
+                _variance_ratio(particles, fused.likelihood, settings.motion, step),
+            )
+        likelihood = likelihood_of(
+            fused.likelihood, self._log_volume, height=fused.prior, height_share=share, variance_factor=factor
+        )
+        found = update(particles, likelihood, settings.motion, step, self._walls, rng)
+        return found, fused.fix.log_evidence - 1.5 * math.log(factor)
+
     def _take_in(
-        self, particles: Particles | None, fused: Fused, step: float, height_share: float, rng: np.random.Generator
+        self,
+        particles: Particles | None,
+        fused: Fused,
+        update_with: Callable[[Particles, np.random.Generator], tuple[Updated | None, float]],
+        rng: np.random.Generator,
     ) -> tuple[Particles | None, TrackState]:
         """Update particles, those that could have moved at all, with a report, or begin anew with it."""
-        assert fused.likelihood is not None
-        updated = None
+        updated, log_new = None, 0.0
         if particles is not None:
-            likelihood = likelihood_of(
-                fused.likelihood, self._log_volume, height=fused.prior, height_share=height_share
-            )
-            updated = update(particles, likelihood, self.settings.motion, step, self._walls, rng)
+            updated, log_new = update_with(particles, rng)
         if updated is None:
             return self._newborn(fused, rng), "restarted"
         self.dropped += updated.dropped
-        share = self._restart_share(fused.fix.log_evidence - updated.log_evidence)
+        share = self._restart_share(log_new - updated.log_evidence)
         newborn = self._newborn(fused, rng) if 2.0 * share * self.settings.num_particles > 1.0 else None
         if newborn is None:
             return updated.particles, "updated"
@@ -233,6 +312,20 @@ class Tracker:
         """Posterior probability that the report begins a new track, given the log ratio of evidence for that."""
         odds = self.settings.restart_probability / (1.0 - self.settings.restart_probability)
         return 1.0 / (1.0 + math.exp(min(-log_ratio - math.log(odds), 700.0)))
+
+
+def _variance_ratio(particles: Particles, hypotheses: Hypotheses, motion: MotionModel, seconds: float) -> float:
+    """Horizontal variance of the particles' prediction, in that of a report."""
+    step = step_of(motion, particles.velocity_variance, seconds)
+    middle = particles.position + seconds * particles.velocity
+    predicted = float((middle.var(axis=0) + step.variance)[:2].sum())
+    weight = np.exp(hypotheses.log_weight - hypotheses.log_weight.max())
+    weight /= weight.sum()
+    mean = weight @ hypotheses.mean
+    spread = weight @ ((hypotheses.mean - mean) ** 2 + np.einsum("hii->hi", hypotheses.cov))
+    told = float(spread[:2].sum())
+    # A broken covariance has no variance to compare with.
+    return predicted / told if math.isfinite(told) and told > 0.0 else 1e6
 
 
 def _tracked(state: TrackState, timestamp: str, num_reports: int, particles: Particles) -> TrackedPosition:

@@ -71,12 +71,21 @@ def _deviations(document: Mapping[str, Any]) -> Deviations:
     azimuth, zenith, length = (
         None if document[name] is None else _number(document[name]) for name in ("azimuth", "zenith", "range")
     )
+    # Tables of earlier versions do not have these two.
+    time, share = (
+        None if document.get(name) is None else _number(document[name])
+        for name in ("correlation_time", "correlated_share")
+    )
+    if (time is not None and time <= 0.0) or (share is not None and not 0.0 <= share <= 1.0):
+        raise ValueError("the drift of a station's errors is out of range")
     return Deviations(
         azimuth=azimuth,
         zenith=zenith,
         range=length,
         tail_share=_number(document["tail_share"]),
         tail_scale=_number(document["tail_scale"]),
+        correlation_time=time,
+        correlated_share=share,
     )
 
 

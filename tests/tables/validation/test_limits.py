@@ -9,13 +9,14 @@ import pytest
 
 from rayfix.client.retries import RetryPolicy
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.tracking.drift import DriftModel
 from rayfix_service.tracking.motion import MotionModel
 from rayfix_service.tracking.settings import TrackingSettings
 from rayfix_tables.errors import RayfixError, SettingsError
 from rayfix_tables.validation.limits import Limits, _limited_fields, check_limits
 
-SETTINGS = [FusionSettings, TrackingSettings, MotionModel, RetryPolicy]
-WITHOUT_LIMITS = {"motion"}
+SETTINGS = [FusionSettings, TrackingSettings, MotionModel, DriftModel, RetryPolicy]
+WITHOUT_LIMITS = {"motion", "drift"}
 
 
 @dataclass(frozen=True, kw_only=True)

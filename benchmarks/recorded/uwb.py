@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks.fusion.uwb_recordings import ANCHORS, Ranging, least_squares, read_ranging, site_text
+from benchmarks.recorded.uwb_recordings import ANCHORS, Ranging, least_squares, read_ranging, site_text
 from rayfix_evaluation.drops.calibration import ellipsoid_holds
 from rayfix_offline.build import build_table
 from rayfix_service.fusion.measurements.report import Height, Range, Report

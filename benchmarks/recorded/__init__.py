@@ -1,0 +1,1 @@
+"""Benchmarks on recorded data that are no part of this repository."""
