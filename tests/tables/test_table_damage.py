@@ -78,7 +78,7 @@ def test_another_programs_hdf5_file(tmp_path: Path) -> None:
     assert "HDF5 file but not a rayfix table" in refused(path, NotATableError, "give a file that 'rayfix build' wrote")
 
 
-@pytest.mark.parametrize("version", [0, 4, 99, "1", -1])
+@pytest.mark.parametrize("version", [0, 5, 99, "1", -1])
 def test_another_format_version(small_table_path: Path, version: int | str) -> None:
     with h5py.File(small_table_path, "r+") as file:
         file.attrs["format_version"] = version
