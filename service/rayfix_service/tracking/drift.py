@@ -28,11 +28,11 @@ NUM_KINDS = 3
 _MOST_SHARE = 0.99
 """Some scatter is left, or a single report would tell the drift exactly."""
 
-_MOST_SECONDS = 10.0
+_MOST_SECONDS = 5.0
 """Longer correlation times count as this one.
 
-Particles are too few to hold for long what they know of a drift: with drifts for ever, 512 of them put 20 % of the
-targets into the 90 % circle at ten reports a second, and 88 % with this bound.
+Particles are too few to hold for long what they know of a drift. With drifts for ever 512 of them, without a bound, put
+20 % of the targets into the 90 % circle at ten reports a second; with 10 s the error still grew with the rate by 5 %.
 """
 
 _KEPT = 5.0
@@ -54,7 +54,7 @@ class DriftModel:
     ----------
     share, correlation_s : float, s
         First kind: the drift's share of a measurement's variance, and the time in which its correlation falls to 37 %.
-        More than 10 s count as 10 s.
+        More than 5 s count as 5 s.
     long_share, long_correlation_s : float, s
         Second kind.
     change_s : float, s
@@ -107,8 +107,8 @@ def variance_factor(stations: Sequence[Station], model: DriftModel, seconds: flo
     """By how much to widen a report that is taken for a Gaussian, since its error is correlated with the track's.
 
     Two estimates of variances p and 1 whose errors have the covariance c have together the variance
-    ``(p - c^2) / (p + 1 - 2 c)``. Taken for independent, the second one must be wider by ``p (p - c^2) / (p - c)^2`` for
-    that. The track's error is, at worst, the drift of the report before: ``c = rho share min(p, 1)``. So reports in
+    ``(p - c^2) / (p + 1 - 2 c)``. Taken for independent, the second one must be wider by ``p (p - c^2) / (p - c)^2``
+    for that. The track's error is, at worst, the drift of the report before: ``c = rho share min(p, 1)``. So reports in
     quick succession add next to nothing to a track that is as good as they are, and count in full where the target may
     have moved. Of several stations the largest factor counts.
 
