@@ -3,6 +3,7 @@
 The published results have the default seed. Use another seed to choose settings of the tracking.
 """
 
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -29,10 +30,13 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=1.0, help="metres a second")
     parser.add_argument("--particles", type=int, default=TrackingSettings().num_particles)
     parser.add_argument("--acceleration-density", type=float, default=MotionModel().acceleration_density)
+    parser.add_argument("--independent", action="store_true", help="take errors for independent: no drift")
     options = parser.parse_args()
     settings = TrackingSettings(
         num_particles=options.particles, motion=MotionModel(acceleration_density=options.acceleration_density)
     )
+    if options.independent:
+        settings = replace(settings, drift=None)
     with open_or_build(options.table) as table:
         begin = perf_counter()
         solver = solver_of(table)

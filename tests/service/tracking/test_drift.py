@@ -25,7 +25,7 @@ def test_the_site_file_decides_for_all_particles():
     assert not model.of(told(0.0, None)).share.any()
     # All of the variance, for ever: some scatter is left, and the time is bounded.
     assert model.of(told(1.0, 1e6)).share.max() < 1.0
-    assert model.of(told(1.0, 1e6)).seconds.max() == 10.0
+    assert model.of(told(1.0, 1e6)).seconds.max() == 5.0
     unknown = model.of(STATION)
     np.testing.assert_array_equal(unknown.share, [0.0, model.share, model.long_share])
     np.testing.assert_array_equal(model.of(told(None, 3.0)).share, unknown.share)
@@ -74,8 +74,8 @@ def test_memory_is_bounded_and_what_was_heard_longest_ago_goes_first():
     np.testing.assert_array_equal(drifts.mean[0, :, 0], [47.0, 48.0, 49.0])
     many = [((f"t{n}", 0), *new) for n in range(5)]
     assert drifts.heard(many, 3).stations == (("t2", 0), ("t3", 0), ("t4", 0))
-    assert drifts.aged(49.0, model, rng).stations == drifts.stations
-    assert drifts.aged(51.0, model, rng).stations == ()
+    assert drifts.aged(24.0, model, rng).stations == drifts.stations
+    assert drifts.aged(26.0, model, rng).stations == ()
 
 
 def test_newborn_particles_know_what_their_report_told():
