@@ -54,7 +54,8 @@ class Fusion:
         self.table = table
         self.settings = settings
         self._uniform_prior = uniform_prior(table.scene.free_space)
-        self._stations = {name: StationMixtures(part) for name, part in table.parts.items()}
+        x, y, z = table.scene.origin.tolist()
+        self._stations = {name: StationMixtures(part, (x, y, z)) for name, part in table.parts.items()}
         largest = max((part.levels[-1].num_components for part in table.parts.values()), default=0)
         self._most_considered = max(self.settings.most_considered, self.settings.considered_tables * largest)
         self._quadrature = Quadrature(table, settings)

@@ -57,7 +57,10 @@ class Leaves(NamedTuple):
     log_volume : ndarray of shape (n,), m3
         Of the block's free part.
     late, lost : ndarray of shape (n, n_factors)
-        Probability that a factor's times are outliers and its angle is not, and that all of it is.
+        Probability that a factor's times are outliers and its angle is not, and that all of it is or that its path is
+        none of the map's.
+    untold : ndarray of shape (n,)
+        Probability that all factors are outliers, so that nothing tells of the position.
     """
 
     point: Array
@@ -69,6 +72,7 @@ class Leaves(NamedTuple):
     log_volume: Array
     late: Array
     lost: Array
+    untold: Array
 
 
 class _Front(NamedTuple):
@@ -119,6 +123,7 @@ def integrate(
     ]
     # Several stations tell of a direction together; half of them, since each tells of two out of three.
     resolution = limits.resolution / max(1.0, 0.5 * len(factors))
+    log_all_outlier = sum(math.log(factor.outlier) for factor in factors)
     halvings = 1 - len(tree.levels)
     front = _largest(tree)
     done: list[Leaves] = []
@@ -140,6 +145,7 @@ def integrate(
             point, height, found = _at_two_heights(front.point, layers.height, at)
         log_mass = log_volume + layers.log_density + found.log_likelihood
         information, late, lost = found.information, found.late, found.lost
+        untold = np.minimum(np.exp(log_all_outlier - found.log_likelihood), 1.0)
         log_all = np.logaddexp(log_done, np.logaddexp.reduce(log_mass, initial=-math.inf))
         halve = (log_mass - log_all > math.log(limits.least_share)) & (
             width**2 / 12.0 * information > limits.resolution
@@ -158,6 +164,7 @@ def integrate(
                 log_volume=log_volume[keep],
                 late=late[:, keep].T,
                 lost=lost[:, keep].T,
+                untold=untold[keep],
             )
         )
         if kept == count:
