@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: docs reference mountings client coverage viewer viewer-test browser screenshots demo lock test test-kernels \
+.PHONY: docs reference mountings propagation client coverage viewer viewer-test browser screenshots demo lock test test-kernels \
 	test-portable test-lowest test-lowest-quick test-newest lint types package audit bom images accuracy openapi clean
 
 # pip takes what builds the package from these too: under the first name until 25.2, under the second from 25.3 on.
@@ -55,6 +55,10 @@ docs: $(VENV)/.docs
 # The documentation's drawings of how arrays are mounted.
 mountings: $(VENV)/.done
 	$(BIN)/python tools/draw_mountings.py
+
+# The documentation's pictures of how signals go.
+propagation: $(VENV)/.done
+	$(BIN)/python tools/draw_propagation.py
 
 # The documentation's pictures, of the demo's table.
 screenshots: demo viewer

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
-from rayfix.commands import building, calibrating, example, judging, locating, pictures, playing, serving
+from rayfix.commands import building, calibrating, comparing, example, judging, locating, pictures, playing, serving
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.version import software_version
 
@@ -49,6 +49,6 @@ def make_parser() -> argparse.ArgumentParser:
         command.set_defaults(run=run)
         return command
 
-    for group in (example, building, locating, playing, pictures, serving, judging, calibrating):
+    for group in (example, building, locating, playing, pictures, serving, judging, calibrating, comparing):
         group.add_commands(add)
     return parser

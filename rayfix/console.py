@@ -150,6 +150,7 @@ def table_info(table: Table) -> dict[str, Any]:
         "bytes": table.path.stat().st_size,
         "faces": len(table.scene.faces),
         "free_space_m3": round(table.scene.free_space.volume, 3),
+        "opaque_walls": not table.passes_walls,
         "origin_m": table.scene.origin.tolist(),
         "stations": [
             {
@@ -196,6 +197,7 @@ def print_table_info(table: Table) -> None:
         f"table_id {facts['table_id']}",
         f"format {facts['format_version']}, written by rayfix {facts['software_version']}",
         f"scene of {facts['faces']:,} triangles, {facts['free_space_m3']:,.0f} m3 of free space",
+        walls_of(table),
     ):
         console.print(line, highlight=False, soft_wrap=True)
     if any(facts["origin_m"]):
@@ -225,6 +227,15 @@ def print_table_info(table: Table) -> None:
                 highlight=False,
                 soft_wrap=True,
             )
+
+
+def walls_of(table: Table) -> str:
+    """Say what a table takes its walls for, and why."""
+    if table.passes_walls:
+        return "walls of known material and thickness let signals through"
+    if table.site.document.get("propagation", {}).get("transmission") is False:
+        return "all walls were taken for opaque, as the site file says: transmission = false"
+    return "all walls were taken for opaque: no material lets signals through"
 
 
 def print_fix(document: Mapping[str, Any]) -> None:

@@ -27,6 +27,7 @@ def main() -> None:
     parser.add_argument("--max-walls", type=int, default=5, help="walls that a path passes beside these")
     parser.add_argument("--scattering", type=float, default=0.3, help="scattered share of the reflected amplitude")
     parser.add_argument("--no-diffraction", action="store_true")
+    parser.add_argument("--no-refraction", action="store_true", help="no path passes a wall")
     parser.add_argument("--samples", type=int, default=50_000, help="rays that are shot from each station")
     parser.add_argument("--batch", type=int, default=10, help="drops at a time, which bounds the memory")
     parser.add_argument("--seed", type=int, default=2026)
@@ -37,7 +38,7 @@ def main() -> None:
     points = clear_points(scene, options.drops, np.random.default_rng([options.seed, 0]))
     physics = Physics(
         carrier_ghz=scene.walls.carrier_ghz,
-        refraction=True,
+        refraction=not options.no_refraction,
         max_interactions=options.max_reflections + options.max_walls,
         diffraction=not options.no_diffraction,
         scattering=options.scattering,

@@ -3,14 +3,15 @@
 ``benchmarks.truth.sionna_drops`` writes the drops. Each station reports its strongest path if that is within 40 dB of
 the best station's. ``--table NAME=FILE`` (repeated) compares tables that are there; ``--build`` makes two of the site:
 one whose walls are opaque, and one whose walls let signals through, without the excess length that Sionna RT leaves
-out.
+out. ``--unmodelled`` sets how probable paths are that the table does not know; ``--specular`` asks the same places in
+the world of the first table, whose paths are straight and reflected.
 """
 
 import argparse
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +20,17 @@ from numpy.typing import NDArray
 
 from rayfix.example.files import write_example
 from rayfix_evaluation.baselines.line_of_sight import LineOfSight
+from rayfix_evaluation.drops.accuracy import solver_of
 from rayfix_evaluation.drops.calibration import ellipsoid_holds, wilson_interval
 from rayfix_evaluation.drops.simulate import Noise, Timing, simulate_report
 from rayfix_evaluation.truth.forward import Paths
 from rayfix_offline.build import build_table
 from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.locator import Locator
 from rayfix_service.wire import parse_report
 from rayfix_tables.checked import open_checked
-from rayfix_tables.geometry.angles import angles_of
+from rayfix_tables.geometry.angles import angles_of, direction
 from rayfix_tables.table import Table
 
 Array = NDArray[np.float64]
@@ -37,6 +40,7 @@ RANGE_STDEV = 0.5  # m
 HEARD_DB = 40.0
 """A station whose strongest path is weaker than the best station's by more reports nothing."""
 REGION = 0.9
+_HEADING = "table            angles  times     50 %    90 %  above 1 m   90 % regions hold    inconsistent  no position"
 _KINDS = ("opaque", "transmission")
 _WAYS = {
     (False, False): "unobstructed",
@@ -64,6 +68,8 @@ def main() -> None:
     parser.add_argument("--site", type=Path, help="the site of the tables to build; a bundled example when left out")
     parser.add_argument("--example", choices=["office", "hall"], default="office")
     parser.add_argument("--jobs", type=int, default=1, help="processes of the builds")
+    parser.add_argument("--unmodelled", type=float, help="prior probability of paths that the table does not know")
+    parser.add_argument("--specular", action="store_true", help="also reports by the first table's image method")
     parser.add_argument("--seed", type=int, default=2026)
     options = parser.parse_args()
     files = {}
@@ -78,14 +84,24 @@ def main() -> None:
         parser.error("there is nothing to compare; give --table or --build")
     drops = np.load(options.drops)
     told = reported_share(drops)
-    print(f"{len(drops['position'])} drops; of the reported paths {told}")
-    print("table            angles  times     50 %    90 %  above 1 m   90 % regions hold    inconsistent  no position")
+    silent = sum(not strongest(drops, number) for number in range(len(drops["position"])))
+    print(f"{len(drops['position'])} drops, {silent} of them heard by no station; of the reported paths {told}")
+    settings = FusionSettings()
+    if options.unmodelled is not None:
+        settings = replace(settings, unmodelled_probability=options.unmodelled)
     with opened(files) as tables:
-        for degrees, timing in CASES:
-            questions = ask(drops, next(iter(tables.values())), degrees, timing, options.seed)
-            for name, table in tables.items():
-                print(f"{name:16} {degrees:5.2f}   {timing:5} {located(table, questions)}", flush=True)
-            print(f"{'robust LOS':16} {degrees:5.2f}   {timing:5} {straight(next(iter(tables.values())), questions)}")
+        first = next(iter(tables.values()))
+        worlds: dict[str, Mapping[str, Array]] = {"Sionna RT": drops}
+        if options.specular:
+            worlds["image method"] = specular_drops(drops["position"], first)
+        for world, found in worlds.items():
+            print(f"reports by {world}")
+            print(_HEADING)
+            for degrees, timing in CASES:
+                questions = ask(found, first, degrees, timing, options.seed)
+                for name, table in tables.items():
+                    print(f"{name:16} {degrees:5.2f}   {timing:5} {located(table, questions, settings)}", flush=True)
+                print(f"{'robust LOS':16} {degrees:5.2f}   {timing:5} {straight(first, questions)}")
 
 
 def build_tables(folder: Path, site: Path | None, options: argparse.Namespace) -> dict[str, Path]:
@@ -133,7 +149,7 @@ def reported_share(drops: Mapping[str, Array]) -> str:
 
 
 def ask(drops: Mapping[str, Array], table: Table, degrees: float, timing: Timing, seed: int) -> list[Question]:
-    """Make a report of each drop; the same draws whatever the deviations."""
+    """Make a report of each drop that a station hears; the same draws whatever the deviations."""
     stations = table.site.stations
     if drops["gain_db"].shape[1] != len(stations):
         raise ValueError(f"the drops have {drops['gain_db'].shape[1]} stations and the table {len(stations)}")
@@ -142,6 +158,8 @@ def ask(drops: Mapping[str, Array], table: Table, degrees: float, timing: Timing
     questions = []
     for number, truth in enumerate(drops["position"]):
         paths = {stations[s].id: path_of(drops, number, s, k) for s, k in strongest(drops, number).items()}
+        if not paths:
+            continue
         report = simulate_report(paths, noise, rng=np.random.default_rng([seed, 1, number]), timing=timing)
         questions.append(Question(truth=truth, report=parse_report(report)))
     return questions
@@ -163,9 +181,27 @@ def path_of(drops: Mapping[str, Array], number: int, station: int, index: int) -
     )
 
 
-def located(table: Table, questions: list[Question]) -> str:
+def specular_drops(positions: Array, table: Table) -> dict[str, Array]:
+    """Strongest path of each link by the image method on a table's triangles, as the file of drops has them."""
+    stations = table.site.stations
+    solvers = [solver_of(table).station(station.position) for station in stations]
+    shape = (len(positions), len(stations), 1)
+    gain, length, heading = np.full(shape, -np.inf), np.zeros(shape), np.zeros((*shape, 3))
+    counts = {name: np.zeros(shape, np.int64) for name in ("num_reflections", "num_walls", "others")}
+    for n, position in enumerate(positions):
+        for s, solver in enumerate(solvers):
+            paths = solver.paths(position)
+            if len(paths):
+                best = paths.only(int(paths.gain_db.argmax()))
+                gain[n, s], length[n, s] = best.gain_db, best.path_length
+                heading[n, s] = direction(best.azimuth, best.zenith)
+                counts["num_reflections"][n, s], counts["num_walls"][n, s] = best.num_reflections, best.num_walls
+    return {"position": positions, "gain_db": gain, "path_length": length, "direction": heading, **counts}
+
+
+def located(table: Table, questions: list[Question], settings: FusionSettings) -> str:
     """Figures of a table's fixes."""
-    locator = Locator(table)
+    locator = Locator(table, settings)
     locator.warm_up()
     fixes = [locator.locate(question.report) for question in questions]
     errors = [

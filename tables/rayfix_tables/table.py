@@ -153,6 +153,11 @@ class Table:
             mapped=mapped,
         )
 
+    @property
+    def passes_walls(self) -> bool:
+        """Whether paths pass walls; otherwise all walls were taken for opaque."""
+        return any(part.wall_coverage for part in self.parts.values())
+
     @cached_property
     def in_table_frame(self) -> "Table":
         """The table with scene and stations in the frame of its components; its fixes are in that frame too."""

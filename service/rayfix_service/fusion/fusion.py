@@ -1,6 +1,9 @@
 """Fuse the measurements of a report: the product of their likelihoods and of the prior."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from rayfix_service.fusion.measurements.calibrated import with_deviations
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
@@ -76,7 +79,8 @@ class Fusion:
         self.table = table
         self.settings = settings
         self._uniform_prior = uniform_prior(table.scene.free_space)
-        self._stations = {name: StationMixtures(part) for name, part in table.parts.items()}
+        x, y, z = table.scene.origin.tolist()
+        self._stations = {name: StationMixtures(part, (x, y, z)) for name, part in table.parts.items()}
         largest = max((part.levels[-1].num_components for part in table.parts.values()), default=0)
         self._most_considered = max(self.settings.most_considered, self.settings.considered_tables * largest)
         self._quadrature = Quadrature(table, settings)
@@ -141,9 +145,17 @@ class Fusion:
             and all(isinstance(each, Angle | Range) for each in report.measurements)
             and not selections_of(report, self.table.site)
         )
-        longest = self.table.site.max_path_length
+        if not exact:
+            return tuple(StationFactor(each.station_id, None) for each in product.observations)
+        settings = replace(self.settings, unmodelled_probability=0.0, unmodelled_without_length=0.0)
+        longest, origin = self.table.site.max_path_length, self.table.scene.origin
         return tuple(
-            StationFactor(each.station_id, path_factor(each, self.settings, longest) if exact else None)
+            StationFactor(
+                each.station_id,
+                path_factor(
+                    each, settings, longest, np.subtract(self.table.parts[each.station_id].station.position, origin)
+                ),
+            )
             for each in product.observations
         )
 

@@ -18,6 +18,15 @@ class FusionSettings:
         Prior probability that a measurement has nothing to do with the position.
     spurious_paths : float
         Paths that a station that reports several is expected to report although there are none.
+    unmodelled_probability : float
+        Prior probability that a path whose angles and length are measured is none of the table's, though it comes from
+        about where the target is: round an edge, off a rough surface, off what is not in the twin; 0 to leave that out.
+    unmodelled_without_length : float
+        The same of a path whose angles alone are measured, or with times against an unknown clock.
+    unmodelled_spread : float, rad
+        Deviation, along either angle, of the direction of such a path from that of the straight one.
+    unmodelled_detour : float, m
+        Mean of what such a path is longer than the straight one; its density is exponential.
     sight_error : float
         Least probability that a receiver's line-of-sight indication is wrong, whatever the indication is.
     beam_width : int
@@ -46,6 +55,8 @@ class FusionSettings:
         that.
     insufficient_above : float, m
         A best candidate whose largest standard deviation is above this makes the fix ``insufficient``.
+    inconsistent_stretch : float
+        By how many times the regions of an inconsistent fix are larger than its posterior says.
     most_turn_fixes : int
         Further fixes that an inconsistent report may take to find stations whose angles are turned; 0 for no search.
 
@@ -57,6 +68,10 @@ class FusionSettings:
 
     outlier_probability: Probability = 0.01
     spurious_paths: Annotated[float, Limits(above=0.0, most=100.0)] = 0.3
+    unmodelled_probability: Annotated[float, Limits(least=0.0, below=0.5)] = 0.1
+    unmodelled_without_length: Annotated[float, Limits(least=0.0, below=0.5)] = 0.0
+    unmodelled_spread: Annotated[float, Limits(above=0.0, most=3.2)] = 0.3
+    unmodelled_detour: Annotated[float, Limits(above=0.0)] = 2.5
     sight_error: Annotated[float, Limits(above=0.0, most=0.5)] = 0.05
     beam_width: Annotated[int, Limits(least=1, most=1_000_000)] = 2048
     most_alternatives: Annotated[int, Limits(least=1)] = 8192
@@ -69,6 +84,7 @@ class FusionSettings:
     ambiguous_below: Probability = 0.7
     most_rivals: Annotated[int, Limits(least=1)] = 3
     insufficient_above: Annotated[float, Limits(above=0.0)] = 3.0
+    inconsistent_stretch: Annotated[float, Limits(least=1.0)] = 1.5
     most_turn_fixes: Annotated[int, Limits(least=0, most=1000)] = 16
 
     def __post_init__(self) -> None:

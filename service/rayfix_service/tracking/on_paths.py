@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.fusion.posterior.fused import StationFactor
+from rayfix_service.fusion.product.unmodelled import NO_PATH
 from rayfix_service.fusion.quadrature.blocks import BlockTree, StationPaths
 from rayfix_service.fusion.quadrature.factor import PathFactor
 from rayfix_service.tracking.drift import DriftModel, Key, Process
@@ -89,6 +90,7 @@ class Stations:
             direct=1.0,
             reflected=1.0,
             outlier=1e-3,
+            unmodelled=NO_PATH,
         )
         return [each for name in list(self._paths)[:1] if (each := self.measured([StationFactor(name, found)]))]
 
@@ -108,7 +110,8 @@ class Stations:
                     key=(station, number),
                     map=near,
                     around=around,
-                    factor=tuple(factor),
+                    # Here a path that the table does not know is an outlier.
+                    factor=tuple(factor[:-1]),
                     whole=np.where(np.isfinite(whole), whole, 0.0),
                     process=self.processes[station],
                 )

@@ -95,7 +95,7 @@ def test_a_fix_of_known_height_equals_its_closed_form(make_table: MakeTable, kin
 
 def test_a_sharp_height_cuts_the_posterior_at_its_plane(make_table: MakeTable) -> None:
     """The paper's two-dimensional case: the Gaussian over (x, y) given z, by the formula for conditional Gaussians."""
-    never = FusionSettings(outlier_probability=1e-15, max_divergence=0.0)
+    never = FusionSettings(outlier_probability=1e-15, unmodelled_probability=0.0, max_divergence=0.0)
     locator = Locator(make_table(*TUBES), never)
     whole = oracle(TUBES, measured("aoa+pt"))
     z = 1.35

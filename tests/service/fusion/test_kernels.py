@@ -423,7 +423,7 @@ def test_closed_form_conditioning_agrees_with_sampling(seed: int, error: str) ->
         angle_index=0,
         timing_indices=(1,),
     )
-    fusion = FusionSettings(component_floor=1e-12, max_divergence=0.0)
+    fusion = FusionSettings(unmodelled_probability=0.0, component_floor=1e-12, max_divergence=0.0)
     prior = Prior(log_volume=LOG_VOLUME)
     factor = make_factor(
         observation, StationMixtures(part), num_clocks=0, max_path_length=60.0, prior=prior, settings=fusion

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import multivariate_normal
 
+from rayfix_service.fusion.product.unmodelled import NO_PATH
 from rayfix_service.fusion.quadrature.factor import PathFactor, evaluate, expected_directions
 from rayfix_service.tracking.path_kernels import propose, refine, settle
 from rayfix_tables.geometry.angles import angles_of
@@ -66,6 +67,7 @@ def factor_of(rng: np.random.Generator, *, zenith: bool = True, length: bool = T
         direct=0.9,
         reflected=0.4,
         outlier=1e-4,
+        unmodelled=NO_PATH,
     )
 
 
@@ -96,7 +98,7 @@ def test_without_drift_the_density_is_that_of_the_quadrature(zenith: bool, lengt
         paths.place,
         paths.paths,
         paths.geometry,
-        tuple(factor),
+        tuple(factor[:-1]),
         0.8,
         no_drift(200),
         rng.random(200),
@@ -126,7 +128,7 @@ def test_densities_and_drifts_are_those_of_a_dense_filter():
         chosen[0][n], chosen[1][n] = paths.paths[1][path], paths.paths[3][path]
         chosen[3][n], chosen[4][n] = rng.integers(2), rng.integers(2)
     drift, out = (mean.copy(), variance.copy(), np.full(count, share)), np.empty(count)
-    settle(points, paths.place, paths.paths, paths.geometry, tuple(factor), whole, drift, np.empty(0), chosen, out)
+    settle(points, paths.place, paths.paths, paths.geometry, tuple(factor[:-1]), whole, drift, np.empty(0), chosen, out)
     for n, point in enumerate(points):
         scale, kind = factor.spreads[chosen[3][n], 1], factor.kinds[chosen[4][n]]
         off = np.array([0.0, factor.zenith, kind[2]]) - paths.expected(
@@ -155,10 +157,10 @@ def test_a_proposal_is_a_kalman_update_about_the_prediction():
     drift = bias, variance, np.full(count, share)
     mean, cov = before.copy(), np.tile(prior, (count, 1, 1))
     chosen, log_chosen = components(count), np.empty(count)
-    arguments = paths.place, paths.paths, paths.geometry, tuple(factor), whole, drift
+    arguments = paths.place, paths.paths, paths.geometry, tuple(factor[:-1]), whole, drift
     propose(mean, cov, before, *arguments, rng.random(count), chosen, log_chosen)
     again, again_cov, log_again = before.copy(), np.tile(prior, (count, 1, 1)), np.empty(count)
-    refine(again, again_cov, before, paths.geometry, tuple(factor), whole, drift, chosen, log_again)
+    refine(again, again_cov, before, paths.geometry, tuple(factor[:-1]), whole, drift, chosen, log_again)
     taken = chosen[0] >= 0
     assert taken.mean() > 0.3
     np.testing.assert_allclose(again, mean, atol=1e-9)

@@ -9,7 +9,7 @@ from rayfix_service.fusion.settings import FusionSettings
 from tests.support.tables.hand_tables import GRID, POSITIONS, Tube, line_of_sight
 
 TUBES = [line_of_sight("a"), line_of_sight("b", log_mass=0.3), line_of_sight("c", log_mass=-0.5)]
-EXACT = FusionSettings(component_floor=1e-30, hypothesis_floor=1e-30, max_divergence=0.0)
+EXACT = FusionSettings(unmodelled_probability=0.0, component_floor=1e-30, hypothesis_floor=1e-30, max_divergence=0.0)
 """Settings with which the fusion leaves out and merges nothing."""
 
 

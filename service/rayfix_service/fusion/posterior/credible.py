@@ -61,12 +61,15 @@ class CredibleRegions:
     share : float
         Probability that the UE is where the points are. If all measurements are outliers it is anywhere, so that no
         region holds it with a higher probability.
+    stretch : float
+        By how many times regions are larger than the points say, where measurements contradict the model.
     """
 
     position: NDArray[np.float64]
     covariance: NDArray[np.float64]
     points: Points
     share: float
+    stretch: float = 1.0
 
     def moved(self, by: NDArray[np.float64]) -> "CredibleRegions":
         """Return the same regions elsewhere, moved by a vector of shape (3,), m."""
@@ -76,8 +79,9 @@ class CredibleRegions:
         """Circle, layer and ellipsoid that each hold the UE with a probability, in one go."""
         places, held = self.points.places(), self._held(probability)
         radius, half_height, shape = _accuracies(_rows(places), self.position, self.covariance, held)
+        shape = self.stretch**2 * shape
         ellipsoid = Ellipsoid(centre=self.position, shape=shape, probability=min(probability, self.share))
-        return Accuracies(radius, half_height, ellipsoid)
+        return Accuracies(self.stretch * radius, self.stretch * half_height, ellipsoid)
 
     def ellipsoid(self, probability: float) -> Ellipsoid:
         """Ellipsoid that holds the UE with a probability.
@@ -91,6 +95,7 @@ class CredibleRegions:
         upright = self.covariance.copy()
         upright[2, :2] = upright[:2, 2] = 0.0
         shape = _reaching(_rows(self.points.places()), self.position, upright, self._held(probability))
+        shape = self.stretch**2 * shape
         return Ellipsoid(centre=self.position, shape=shape, probability=min(probability, self.share))
 
     def horizontal_radius(self, probability: float) -> float:
@@ -100,7 +105,7 @@ class CredibleRegions:
     def horizontal_radii(self, probabilities: Sequence[float]) -> list[float]:
         """Radii, m, of the horizontal circles of several probabilities, in one go."""
         apart = np.sort(np.hypot(*(self.points.places() - self.position).T[:2]))
-        return [float(apart[_rank(self._held(p), len(apart))]) for p in probabilities]
+        return [self.stretch * float(apart[_rank(self._held(p), len(apart))]) for p in probabilities]
 
     def vertical_half_height(self, probability: float) -> float:
         """Half the height, m, of the layer that holds the UE with a probability."""

@@ -91,7 +91,11 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
             status = _status(candidates, summary.half_bad, settings)
             best = candidates[0]
             regions = CredibleRegions(
-                position=best.position, covariance=best.covariance, points=summary.points, share=share
+                position=best.position,
+                covariance=best.covariance,
+                points=summary.points,
+                share=share,
+                stretch=settings.inconsistent_stretch if status == "inconsistent" else 1.0,
             )
     unused = product.unused
     outcomes = tuple(

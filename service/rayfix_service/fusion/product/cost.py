@@ -64,6 +64,9 @@ _HYPOTHESES = 256
 _HYPOTHESIS = 3e-6
 """What summing a hypothesis up takes, s."""
 
+_UNMODELLED = 5
+"""Alternatives that the path is none of the table's, for each combination of the errors of its length."""
+
 _FEW, _FEW_COMPONENTS, _FEW_SECONDS = 4, 128, 2e-3
 """So many measurements of narrow angles, in cells of no more components, take less than so long, s."""
 
@@ -193,7 +196,9 @@ class CostEstimate:
             kinds = combinations + (1 if of.angles and (of.readings or of.lengths) else 0)
             considered = found * kinds
             seconds += _PATH + cost + _LOOKED_UP * found + _CONSIDERED * considered
-            alternatives.append(min(considered, _PER_PART * parts * kinds, self._settings.most_alternatives) + 1)
+            unmodelled = _UNMODELLED * combinations if of.angles and of.lengths and not of.readings else 0
+            found_at_most = min(considered, _PER_PART * parts * kinds, self._settings.most_alternatives)
+            alternatives.append(found_at_most + unmodelled + 1)
         return seconds
 
     def _looked_up(self, name: str, angle: Angle | None, judged: bool) -> tuple[float, int, int]:

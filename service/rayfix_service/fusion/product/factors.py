@@ -16,6 +16,7 @@ from rayfix_service.fusion.measurements.observations import Observation
 from rayfix_service.fusion.product.beam_kernels import product_costs
 from rayfix_service.fusion.product.factor_kernels import (
     ALL_GOOD,
+    ALL_OUTLIER,
     PART,
     READING,
     TIME_OUTLIER,
@@ -24,6 +25,7 @@ from rayfix_service.fusion.product.factor_kernels import (
 )
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.product.station_mixture import StationMixtures, join
+from rayfix_service.fusion.product.unmodelled import unmodelled_columns, unmodelled_path
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
 
@@ -98,7 +100,11 @@ def make_factor(
     if bounds[-1] == 0:
         return None
     kinds, readings, log_outlier = kinds_of(observation, settings.outlier_probability, max_path_length)
-    log_good = math.log1p(-settings.outlier_probability)
+    lengths = [kind[1:4] for kind in kinds if kind.outlier == ALL_GOOD]
+    unmodelled = unmodelled_path(
+        observation, lengths, station.position, any_time(observation, max_path_length), settings
+    )
+    log_good = math.log1p(-settings.outlier_probability - (unmodelled.probability if unmodelled else 0.0))
     parts = [
         (kind.outlier, bounds[n], bounds[n + 1], log_good + spread.log_weight + kind.log_weight, *kind[2:])
         for kind in kinds
@@ -128,6 +134,10 @@ def make_factor(
         stop.cell,
     )
     stop.check()
+    if unmodelled is not None:
+        added = unmodelled_columns(tuple(unmodelled), max_path_length, 3 + num_clocks)
+        columns = np.concatenate([columns[:, :-1], added, columns[:, -1:]], axis=1)
+        outlier = np.concatenate([outlier[:-1], np.full(added.shape[1] + 1, ALL_OUTLIER, np.int8)])
     return Factor(
         columns=columns,
         outlier=outlier,
@@ -177,16 +187,22 @@ def kinds_of(
     Also gives the readings of clocks that these take in, as :data:`READING` has them, and the log density of the
     outlier.
     """
-    # Noise counts, so that a measurement with very much of it does not look like an outlier.
-    log_any_time = 0.0
-    for variance in _time_variances(observation):
-        log_any_time -= math.log(max_path_length + math.sqrt(2.0 * math.pi * variance))
+    log_any_time = any_time(observation, max_path_length)
     log_good, log_bad = math.log1p(-outlier_probability), math.log(outlier_probability)
     may_be_late = observation.angle_index is not None and bool(observation.lengths or observation.readings)
     kinds, readings = _good_kinds(observation, log_good if may_be_late else 0.0, max_path_length)
     if may_be_late:
         kinds.append(Kind(TIME_OUTLIER, log_bad + log_any_time, *_ANY_LENGTH[1:]))
     return kinds, readings, log_bad + log_any_time - _log_angle_range(observation)
+
+
+def any_time(observation: Observation, max_path_length: float) -> float:
+    """Log density of an observation's times where they may be any."""
+    # Noise counts, so that a measurement with very much of it does not look like an outlier.
+    log_density = 0.0
+    for variance in _time_variances(observation):
+        log_density -= math.log(max_path_length + math.sqrt(2.0 * math.pi * variance))
+    return log_density
 
 
 def _good_kinds(

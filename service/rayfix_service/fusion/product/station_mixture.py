@@ -62,9 +62,22 @@ def join(parts: Sequence[StationMixture]) -> StationMixture:
 
 @dataclass(frozen=True)
 class StationMixtures:
-    """A station's part of the table, and what follows from it for reports without an angle."""
+    """A station's part of the table, and what follows from it for reports without an angle.
+
+    Attributes
+    ----------
+    part : StationPart
+    origin : tuple of 3 floats, m
+        Of the frame of the part's Gaussians, in the scene's.
+    """
 
     part: StationPart
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @cached_property
+    def position(self) -> NDArray[np.float64]:
+        """Position of the station in the frame of the Gaussians, shape (3,), m."""
+        return np.subtract(self.part.station.position, self.origin)
 
     def towards(self, measured: Direction, weights: LineOfSightWeights | None = None) -> StationMixture:
         """Gaussians of the paths from a measured direction; none where no ray comes.

@@ -79,13 +79,12 @@ class GridPosterior:
     def hypotheses(self) -> Hypotheses:
         """Return a Gaussian for each block, the best first, about as wide as its block."""
         leaves = self.leaves
-        lost = leaves.lost.prod(axis=1)
-        good = np.flatnonzero(lost < 1.0 - 1e-12)
+        good = np.flatnonzero(leaves.untold < 1.0 - 1e-12)
         order = good[np.argsort(-leaves.log_mass[good], kind="stable")]
         half = 0.5 * np.stack([leaves.width[order], leaves.width[order], leaves.height[order]], axis=1)
         outlier = np.where(leaves.lost[order] > 0.5, ALL_OUTLIER, ALL_GOOD)
         return Hypotheses(
-            log_weight=leaves.log_mass[order] + np.log1p(-lost[order]),
+            log_weight=leaves.log_mass[order] + np.log1p(-leaves.untold[order]),
             mean=leaves.point[order],
             cov=half[:, :, None] ** 2 * np.eye(3),
             outlier=outlier.astype(np.int8),
@@ -183,7 +182,9 @@ class Quadrature:
         FixStoppedError
             When it was stopped.
         """
-        factors = [path_factor(each, self._settings, self._table.site.max_path_length) for each in observations]
+        longest, origin = self._table.site.max_path_length, self._table.scene.origin
+        at = {name: np.subtract(part.station.position, origin) for name, part in self._table.parts.items()}
+        factors = [path_factor(each, self._settings, longest, at[each.station_id]) for each in observations]
         stations = [self._station(each.station_id, selections.get(each.station_id)) for each in observations]
         sets = NO_SETS if paths is None else self._sets(paths)
         leaves, omitted = integrate(self.tree, stations, factors, prior, self._limits, stop, sets)

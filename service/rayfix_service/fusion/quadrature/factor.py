@@ -1,6 +1,7 @@
 """The likelihood of positions given the measurements of one path, from the path map.
 
-    p(y | x) = (1 - e) sum_k w_k(x) p(angles | direction_k(x)) p(lengths | length_k(x)) + e p_outlier
+    p(y | x) = (1 - e - u) sum_k w_k(x) p(angles | direction_k(x)) p(lengths | length_k(x))
+               + u p_unmodelled(y | x) + e p_outlier
 
 with the weights w_k and the geometry of the paths k to x, in the units that the factors of Gaussians have
 (:mod:`rayfix_service.fusion.product.factors`).
@@ -12,6 +13,8 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from rayfix_service.fusion.product.unmodelled import UnmodelledPath, unmodelled_density
 
 _NEGLIGIBLE = 3e-3
 """Paths that could add no more than this fraction of what others have added, the outlier included, are left out."""
@@ -39,6 +42,7 @@ class PathFactor(NamedTuple):
         Weights of direct paths and of all others, from a line-of-sight indication.
     outlier : float
         Density of the case that all of it is an outlier.
+    unmodelled : UnmodelledPath
     """
 
     turn: NDArray[np.float64]
@@ -49,6 +53,7 @@ class PathFactor(NamedTuple):
     direct: float
     reflected: float
     outlier: float
+    unmodelled: UnmodelledPath
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -70,13 +75,13 @@ def evaluate(
         Of :class:`.blocks.BlockPaths`; images, mirrors, numbers of reflections, and the measured direction after the
         reflections (:func:`expected_directions`); of :class:`PathFactor`.
     out : tuple of ndarrays of shape (n,)
-        Changed in place: the density; the fractions of it that times are outliers, and that all is; the information
-        about the position [1 / m2].
+        Changed in place: the density; the fractions of it that times are outliers, and that all is or that the path is
+        none of the map's; the information about the position [1 / m2].
     """
     offsets, sequence, weight, excess, num_walls = paths
     passes = len(excess) > 0
     images, mirrors, reflections, expected = geometry
-    turn, zenith, cov, spreads, kinds, direct, reflected, outlier = factor
+    turn, zenith, cov, spreads, kinds, direct, reflected, outlier, unmodelled = factor
     density, late, lost, information = out
     with_angle, with_zenith = np.isfinite(cov[0]), np.isfinite(cov[2])
     peak = _peak(zenith, cov, kinds) * max(direct, reflected)
@@ -86,10 +91,12 @@ def evaluate(
     length_variance = kinds[:, 3].min()
     sine, cosine = np.sin(zenith), np.cos(zenith)
     for n in range(len(points)):
-        good, bad, sharp = 0.0, 0.0, 0.0
+        good, bad = 0.0, 0.0
+        x, y, z = points[n]
+        unknown, sharp = unmodelled_density(unmodelled, x, y, z, spread)
         for path in range(offsets[blocks[n]], offsets[blocks[n] + 1]):
             own = float(weight[path])
-            if own * peak < _NEGLIGIBLE * (good + bad + outlier):
+            if own * peak < _NEGLIGIBLE * (good + bad + unknown + outlier):
                 break
             s = sequence[path]
             own *= direct if reflections[s] == 0 and not (passes and num_walls[path] > 0) else reflected
@@ -131,10 +138,10 @@ def evaluate(
                 else:
                     good += of_length
             sharp += added * told
-        total = good + bad + outlier
+        total = good + bad + unknown + outlier
         density[n] = total
         late[n] = bad / total
-        lost[n] = outlier / total
+        lost[n] = (unknown + outlier) / total
         information[n] = sharp / total
 
 

@@ -58,8 +58,10 @@ class Leaves(NamedTuple):
     log_volume : ndarray of shape (n,), m3
         Of the block's free part.
     late, lost : ndarray of shape (n, n_factors + n_measured)
-        Probability that a factor's times are outliers and its angle is not, and that all of it is; for the measured
-        paths of sets, after the factors, that they are spurious.
+        Probability that a factor's times are outliers and its angle is not, and that all of it is or that its path is
+        none of the map's; for the measured paths of sets, after the factors, that they are spurious.
+    untold : ndarray of shape (n,)
+        Probability that all factors are outliers and all measured paths spurious: nothing tells of the position.
     """
 
     point: Array
@@ -71,6 +73,7 @@ class Leaves(NamedTuple):
     log_volume: Array
     late: Array
     lost: Array
+    untold: Array
 
 
 class _Front(NamedTuple):
@@ -124,6 +127,7 @@ def integrate(
     ]
     # Several stations tell of a direction together; half of them, since each tells of two out of three.
     resolution = limits.resolution / max(1.0, 0.5 * (len(factors) + len(sets)))
+    log_all_outlier = sum(math.log(factor.outlier) for factor in factors) + sets.log_all_spurious
     halvings = 1 - len(tree.levels)
     front = _largest(tree)
     done: list[Leaves] = []
@@ -147,6 +151,7 @@ def integrate(
             point, height, found = _at_two_heights(front.point, layers.height, at)
         log_mass = log_volume + layers.log_density + found.log_likelihood
         information, late, lost = found.information, found.late, found.lost
+        untold = np.minimum(np.exp(log_all_outlier - found.log_likelihood), 1.0)
         log_all = np.logaddexp(log_done, np.logaddexp.reduce(log_mass, initial=-math.inf))
         halve = (log_mass - log_all > math.log(limits.least_share)) & (
             width**2 / 12.0 * information > limits.resolution
@@ -165,6 +170,7 @@ def integrate(
                 log_volume=log_volume[keep],
                 late=late[:, keep].T,
                 lost=lost[:, keep].T,
+                untold=untold[keep],
             )
         )
         if kept == count:

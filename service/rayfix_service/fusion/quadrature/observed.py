@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from rayfix_service.fusion.measurements.directions import Direction, MeasuredAngles
 from rayfix_service.fusion.measurements.line_of_sight import LineOfSightWeights, line_of_sight_weights
 from rayfix_service.fusion.measurements.observations import Observation
-from rayfix_service.fusion.product.factors import kinds_of
+from rayfix_service.fusion.product.factor_kernels import ALL_GOOD
+from rayfix_service.fusion.product.factors import any_time, kinds_of
+from rayfix_service.fusion.product.unmodelled import NO_PATH, unmodelled_path
 from rayfix_service.fusion.quadrature.factor import PathFactor
 from rayfix_service.fusion.settings import FusionSettings
 
@@ -16,19 +18,26 @@ _NO_INDICATION = LineOfSightWeights(0.0, 0.0)
 _SCENE = np.eye(3)
 
 
-def path_factor(observation: Observation, settings: FusionSettings, max_path_length: float) -> PathFactor:
+def path_factor(
+    observation: Observation, settings: FusionSettings, max_path_length: float, station: NDArray[np.float64]
+) -> PathFactor:
     """Measurements of one path as the kernel takes them; the times must not depend on a clock.
 
     Parameters
     ----------
     max_path_length : float, m
         A time that is an outlier may be anything up to this, and noise.
+    station : ndarray of shape (3,), m
+        Position in the frame of the path map.
     """
     kinds, _, log_outlier = kinds_of(observation, settings.outlier_probability, max_path_length)
     indicated = observation.los_probability
     weights = _NO_INDICATION if indicated is None else line_of_sight_weights(indicated, settings.sight_error)
     turn, zenith, cov = measured_direction(observation.direction)
-    log_good = math.log1p(-settings.outlier_probability)
+    lengths = [kind[1:4] for kind in kinds if kind.outlier == ALL_GOOD]
+    any_log = any_time(observation, max_path_length)
+    path = unmodelled_path(observation, lengths, station, any_log, settings)
+    log_good = math.log1p(-settings.outlier_probability - (path.probability if path else 0.0))
     return PathFactor(
         turn=turn,
         zenith=zenith,
@@ -40,6 +49,7 @@ def path_factor(observation: Observation, settings: FusionSettings, max_path_len
         direct=math.exp(weights.log_direct),
         reflected=math.exp(weights.log_reflected),
         outlier=math.exp(log_outlier),
+        unmodelled=NO_PATH if path is None else path,
     )
 
 

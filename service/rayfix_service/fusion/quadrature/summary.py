@@ -39,7 +39,7 @@ def sum_up_leaves(
     share = np.exp(leaves.log_mass - log_evidence)
     lost = min(1.0, math.exp(log_all_outlier - log_evidence))
     outlier, half_bad = _outliers(share, leaves.late, leaves.lost, index.rows, len(index.places), ALL_OUTLIER)
-    good = share * (1.0 - leaves.lost.prod(axis=1))
+    good = share * (1.0 - leaves.untold)
     top = modes_of_blocks(leaves.halvings, leaves.cell, leaves.log_mass - leaves.log_volume, VALLEY)
     space = free_space.origin, free_space.voxel_size, free_space.free
     stop.check()

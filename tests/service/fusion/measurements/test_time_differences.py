@@ -73,7 +73,7 @@ def test_a_reference_that_is_late_spoils_all_its_differences(make_table: MakeTab
 
 def test_time_differences_to_one_reference_are_correlated(make_table: MakeTable) -> None:
     """Generalised least squares with the covariance s^2 (I + 1 1^T) of two differences of deviation sqrt(2) s."""
-    never = FusionSettings(outlier_probability=1e-15, max_divergence=0.0)
+    never = FusionSettings(outlier_probability=1e-15, unmodelled_probability=0.0, max_divergence=0.0)
     measurements = differences("a")
     fix = Locator(make_table(*TUBES), never).locate(report_of(measurements))
     covs = []

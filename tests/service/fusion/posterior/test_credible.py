@@ -54,6 +54,17 @@ def held(ellipsoid: Ellipsoid, points: Array) -> float:
     return float(np.mean([ellipsoid.holds(point) for point in points]))
 
 
+def test_regions_are_stretched() -> None:
+    regions = around(np.diag([0.04, 0.09, 0.01]))
+    larger = replace(regions, stretch=1.5)
+    assert larger.horizontal_radius(0.9) == pytest.approx(1.5 * regions.horizontal_radius(0.9))
+    assert larger.horizontal_radii([0.5, 0.9]) == pytest.approx([1.5 * r for r in regions.horizontal_radii([0.5, 0.9])])
+    assert larger.vertical_half_height(0.9) == pytest.approx(1.5 * regions.vertical_half_height(0.9))
+    assert larger.ellipsoid(0.9).semi_axes == pytest.approx(1.5 * regions.ellipsoid(0.9).semi_axes)
+    assert larger.upright_ellipsoid(0.9).semi_axes == pytest.approx(1.5 * regions.upright_ellipsoid(0.9).semi_axes)
+    assert larger.moved(np.ones(3)).stretch == 1.5
+
+
 # --- one Gaussian in the open ----------------------------------------------------------------------------
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import exponnorm, vonmises_fisher
 
 from rayfix_service.fusion.measurements.report import GAUSSIAN, Angle, ErrorModel, Height, Range, Report
 from rayfix_service.fusion.posterior.fix import Fix
@@ -18,7 +19,7 @@ from tests.support.tables.open_room import HEIGHT, POSITIONS, SIDE, open_room_ta
 Array = NDArray[np.float64]
 TRUTH = np.array([2.2, 3.7, 1.1])
 TAILS = ErrorModel(tail_share=0.2, tail_scale=3.0)
-OUTLIER = 0.01
+OUTLIER, SPREAD, DETOUR = 0.01, 0.3, 2.5
 STEP = 0.05  # m, of the oracle's grid
 
 
@@ -59,8 +60,37 @@ def normal(error: Array, stdev: float, model: ErrorModel = GAUSSIAN) -> Array:
     return total
 
 
-def log_likelihood(report: Report, places: Array) -> Array:
-    """Sum of the logs of the stations' densities, in the units of rayfix's evidence."""
+def of_unmodelled(own: list[Angle | Range], apart: Array, spread: float, detour: float) -> Array:
+    """Density of a path that the map does not know: von Mises-Fisher by exponential with the error of the length.
+
+    Three in ten have a quarter of the spread and no detour.
+    """
+    distance = np.linalg.norm(apart, axis=1)
+    total = np.zeros(len(apart))
+    for share, wide, longer in ((0.3, 0.25 * spread, 0.0), (0.7, spread, detour)):
+        part = np.full(len(apart), share)
+        for each in own:
+            if isinstance(each, Range):
+                error = each.path_length - distance
+                if longer == 0.0:
+                    part *= normal(error, each.stdev)
+                else:
+                    part *= exponnorm.pdf(error, longer / each.stdev, scale=each.stdev)
+            elif each.zenith is None:
+                part /= 2.0 * np.pi
+            else:
+                sine, cosine = np.sin(each.zenith), np.cos(each.zenith)
+                heading = np.array([sine * np.cos(each.azimuth), sine * np.sin(each.azimuth), cosine])
+                part *= vonmises_fisher(heading, 1.0 / wide**2).pdf(apart / distance[:, None])
+        total += part
+    return total
+
+
+def log_likelihood(report: Report, places: Array, unmodelled: float = 0.1, *, alone: bool = False) -> Array:
+    """Sum of the logs of the stations' densities, in the units of rayfix's evidence.
+
+    ``alone`` says whether unmodelled paths may be those of angles without a time.
+    """
     total = np.zeros(len(places))
     for name in {measurement.station_id for measurement in report.measurements}:
         own = [measurement for measurement in report.measurements if measurement.station_id == name]
@@ -91,16 +121,20 @@ def log_likelihood(report: Report, places: Array) -> Array:
                 any_length = 30.0 + np.sqrt(2.0 * np.pi) * each.stdev
         if any_direction > 1.0 and any_length > 1.0:  # the time alone may be an outlier
             lengths = (1.0 - OUTLIER) * lengths + OUTLIER / any_length
-        total += np.log((1.0 - OUTLIER) * good * lengths + OUTLIER / any_length / any_direction)
+        density = (1.0 - OUTLIER) * good * lengths + OUTLIER / any_length / any_direction
+        if any_direction == 4.0 * np.pi and (any_length > 1.0 or alone):
+            density -= unmodelled * good * lengths
+            density += unmodelled * of_unmodelled(own, places - POSITIONS[name], SPREAD, DETOUR)
+        total += np.log(density)
     return total
 
 
-def exact(report: Report, places: Array) -> tuple[float, Array, Array]:
+def exact(report: Report, places: Array, unmodelled: float = 0.1, *, alone: bool = False) -> tuple[float, Array, Array]:
     """Log evidence, mean and covariance of the posterior, summed over the cells."""
     prior = np.zeros(len(places))
     if report.height is not None:
         prior = -0.5 * ((places[:, 2] - report.height.z) / report.height.stdev) ** 2
-    log = log_likelihood(report, places) + prior - np.logaddexp.reduce(prior)
+    log = log_likelihood(report, places, unmodelled, alone=alone) + prior - np.logaddexp.reduce(prior)
     evidence = float(np.logaddexp.reduce(log))
     share = np.exp(log - evidence)
     mean = share @ places

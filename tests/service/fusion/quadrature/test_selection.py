@@ -13,6 +13,7 @@ from rayfix_service.fusion.quadrature.blocks import BlockPaths, BlockTree
 from rayfix_service.fusion.quadrature.reweighted import Reweighted
 from rayfix_service.fusion.quadrature.selection import detected_paths, selected_paths
 from rayfix_service.fusion.quadrature.spread import spread_paths
+from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.locator import Locator
 from rayfix_service.wire import InvalidReportError, parse_report, report_to_document
 from rayfix_tables.errors import ReportError
@@ -176,7 +177,7 @@ def reflected(**selection: object) -> dict[str, object]:
 
 def test_the_evidence_changes_as_the_weight_of_the_path_does(mirrored: Table) -> None:
     """At the place the path by the wall has the gain of its length, relative to the direct one."""
-    locator = Locator(mirrored)
+    locator = Locator(mirrored, FusionSettings(unmodelled_probability=0.0))
     either = locator.locate(reflected(rule="any"))
     assert either.position is not None
     assert np.linalg.norm(either.position - PLACE) < 0.05
