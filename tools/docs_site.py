@@ -30,9 +30,11 @@ API = {
         "Reports",
         "What a report holds. Angles are in radians, lengths in metres.",
         (
-            *("Report", "Measurement", "Angle", "Range", "TimeOfArrival", "TimeDifference", "LogRange", "Height"),
+            *("Report", "Measurement", "Angle", "Range", "TimeOfArrival", "TimeDifference", "LogRange", "MeasuredPath"),
+            "Height",
             *("Frame", "ErrorModel", "GAUSSIAN", "HEAVY_TAILED", "range_from_times", "range_from_round_trip"),
             *("range_from_rssi", "range_from_impulse_response", "RangeEstimate", "LogRangeEstimate"),
+            *("paths_from_impulse_response", "PathEstimate"),
         ),
     ),
     "fixes": (
