@@ -47,6 +47,12 @@ def print_check(check: "Check") -> None:
     if check.escapes:
         escaped = ", ".join(f"{escapes.station_id} {escapes.share:.2%}" for escapes in check.escapes)
         lines.append(f"rays that leave the scene: {escaped}")
+    windows = ", ".join(f"{window:g}" for window in check.windows_deg)
+    lines.append(
+        f"windows of {windows} deg: angles with deviations of up to {check.best_up_to_deg:.3g} deg are looked up in "
+        f"one cell, up to {check.integrated_from_deg:.3g} deg in several; wider ones, and times alone, are integrated "
+        f"on the path map; beside times of unknown clocks, angles of up to {check.quick_up_to_deg:.3g} deg are quick"
+    )
     size = " x ".join(f"{length:.6g}" for length in twin.scene.bounds[1] - twin.scene.bounds[0])
     curved = f" in {twin.planes.num_surfaces:,} surfaces" if twin.planes.curved else ""
     lines.append(

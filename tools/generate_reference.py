@@ -33,8 +33,10 @@ SITE_WINDOWS = """
 
 A window is the standard deviation of the angles that a cell stands for. A measured angle is looked up in the finest level whose
 window is at least 1.25 times its own deviation; one level serves every smaller deviation, since the look-up makes up for the rest.
-An angle wider than all windows is summed over many cells, which takes longer. So the finest window decides what the smallest
-deviations can be worth, the widest what is quick, and what lies between saves time:
+An angle wider than all windows is summed over many cells, which takes longer. Angles of more than 1.28 times the finest window, and times
+alone, are integrated on the path map instead, unless a clock is unknown or signal strengths are reported. `rayfix check` tells these
+limits of a site. So the finest window decides what the smallest deviations can be worth, the widest what is quick, and what lies
+between saves time:
 
 | sensors | deviation of their angles | `windows_deg` |
 |---|---|---|

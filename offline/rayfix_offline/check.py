@@ -8,6 +8,7 @@ from rayfix_offline.rays.lost_rays import LOST_RAYS_WARNING, Escapes, find_escap
 from rayfix_offline.site import read_site
 from rayfix_offline.twin.findings import Finding
 from rayfix_offline.twin.twin import Twin, prepare_twin
+from rayfix_tables.level import WIDE_RATIO, WINDOW_RATIO
 
 NOTABLE_FRACTION = 0.05
 """The position where most rays leave is named if at least this fraction of the lost rays leave there."""
@@ -33,6 +34,26 @@ class Check:
         """Number of findings that stop a build."""
         return sum(finding.severity == "error" for finding in self.findings)
 
+    @property
+    def windows_deg(self) -> tuple[float, ...]:
+        """Windows of angles, finest first."""
+        return tuple(self.twin.site.table.windows_deg)
+
+    @property
+    def best_up_to_deg(self) -> float:
+        """Deviation of angles up to which one cell of the finest window answers."""
+        return self.windows_deg[0] / WINDOW_RATIO
+
+    @property
+    def integrated_from_deg(self) -> float:
+        """Deviation of angles from which on they are integrated on the path map, where no clock is unknown."""
+        return self.windows_deg[0] * WIDE_RATIO
+
+    @property
+    def quick_up_to_deg(self) -> float:
+        """Deviation of angles beside times of unknown clocks up to which one cell answers."""
+        return self.windows_deg[-1] / WINDOW_RATIO
+
     def document(self) -> dict[str, Any]:
         """Return the check as JSON-compatible data."""
         twin = self.twin
@@ -56,6 +77,12 @@ class Check:
                 }
                 for escapes in self.escapes
             ],
+            "windows": {
+                "windows_deg": list(self.windows_deg),
+                "best_up_to_deg": round(self.best_up_to_deg, 6),
+                "integrated_from_deg": round(self.integrated_from_deg, 6),
+                "unknown_clocks_quick_up_to_deg": round(self.quick_up_to_deg, 6),
+            },
             "findings": [
                 {
                     "severity": finding.severity,

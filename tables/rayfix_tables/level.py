@@ -13,6 +13,9 @@ from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 WINDOW_RATIO = 1.25
 """A window's standard deviation is at least this times that of the measurements that it is used for."""
 
+WIDE_RATIO = 1.28
+"""Angles of more than this many deviations of the finest window are wide: they are integrated on the path map."""
+
 UNBALANCED: NDArray[np.float32] = np.zeros(0, np.float32)
 """``log_balance`` of a level without one; read-only, like the mapped arrays that kernels are compiled for."""
 UNBALANCED.flags.writeable = False

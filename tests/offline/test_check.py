@@ -97,7 +97,7 @@ def test_the_command(tmp_path: Path, write_site: WriteSite, capsys: pytest.Captu
     assert main(["check", str(path)]) == 2
     lines = capsys.readouterr().out.splitlines()
     starts = [line.split(":")[0] for line in lines]
-    assert starts == ["warning", "error", "rays that leave the scene", str(path)]
+    assert starts == ["warning", "error", "rays that leave the scene", "windows of 10 deg", str(path)]
     assert main(["check", str(path), "--json"]) == 2
     document = json.loads(capsys.readouterr().out)
     assert [(f["severity"], f["kind"], f["station_id"]) for f in document["findings"]] == [
@@ -108,6 +108,12 @@ def test_the_command(tmp_path: Path, write_site: WriteSite, capsys: pytest.Captu
     assert document["scene"]["closed"] is True
     assert document["scene"]["size_m"] == [4.0, 5.0, 3.0]
     assert document["scene"]["triangles"] == 36
+    assert document["windows"] == {
+        "windows_deg": [10.0],
+        "best_up_to_deg": 8.0,
+        "integrated_from_deg": 12.8,
+        "unknown_clocks_quick_up_to_deg": 8.0,
+    }
 
 
 def write_far_room(folder: Path, shift: NDArray[np.float64], *, file_type: str) -> Path:

@@ -22,15 +22,12 @@ from rayfix_service.fusion.quadrature.summary import sum_up_leaves
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.freespace import FreeSpace
+from rayfix_tables.level import WIDE_RATIO
 from rayfix_tables.site import Selection
 from rayfix_tables.table import Table
 
 _FINEST_LENGTH = 0.05
 """Reports with a path length that is more accurate, m, are left to Gaussians: its shells are thin."""
-
-_WIDER_THAN = 1.28
-"""Angles are wide from this many deviations of the finest window on; a sum of its cells answers narrower ones."""
-
 
 NO_SELECTIONS: Mapping[str, Selection] = {}
 """Of stations whose rules are the table's."""
@@ -130,7 +127,7 @@ class Quadrature:
         part = self._table.parts[observation.station_id]
         if any(term.variance < _FINEST_LENGTH**2 for terms in observation.lengths for term in terms):
             return False
-        return _narrowest(observation) > _WIDER_THAN * part.levels[0].window
+        return _narrowest(observation) > WIDE_RATIO * part.levels[0].window
 
     def seconds(self, report: Report, selections: Mapping[str, Selection] = NO_SELECTIONS) -> float | None:
         """Estimate how long a fix will take here, s; None for a report that Gaussians answer.
@@ -145,7 +142,7 @@ class Quadrature:
                 return None
             if isinstance(m, Angle):
                 stdevs = [m.azimuth_stdev] if m.zenith_stdev is None else [m.azimuth_stdev, m.zenith_stdev]
-                if not selections and min(stdevs) <= _WIDER_THAN * part.levels[0].window:
+                if not selections and min(stdevs) <= WIDE_RATIO * part.levels[0].window:
                     return None
                 known += len(stdevs)
                 combinations += len(spreads(m.error_model)) - 1
