@@ -129,6 +129,7 @@ NOT_IN_IDENTITY = {
     "tables.gaussians.normal_points.unit_points": "used by the service only",
     "tables.level.WINDOW_RATIO": "the default of window_ratio in CoarseFit and BalanceSettings",
     "tables.level.UNBALANCED": "an empty array",
+    "tables.level.WIDE_RATIO": "of the look-up, not of the table",
     "tables.mixture.FIELD_SHAPES": "the table's format, whose version is in the identity",
     "tables.mixture._UPPER": "the table's format, whose version is in the identity",
     "tables.mixture._UNPACK": "the table's format, whose version is in the identity",

@@ -82,3 +82,26 @@ def open_room_table(path: Path, space: FreeSpace | None = None, *, stations: tup
     site = SiteInfo(name="room", north=0.0, max_path_length=30.0, stations=stations, document={})
     write_table(path, site=site, scene=scene, parts=parts, software_version="1")
     return Table.open(path)
+
+
+def mirrored_room_table(folder: Path) -> Table:
+    """Return the open room with a second path to each place, by the wall at x = 6 m, without a loss."""
+    table = open_room_table(folder / "t.h5")
+    parts = {}
+    for name, part in table.parts.items():
+        assert part.paths is not None
+        count = len(part.paths)
+        x, y, z = POSITIONS[name]
+        paths = replace(
+            part.paths,
+            offsets=2 * part.paths.offsets,
+            sequence=np.tile(np.array([0, 1], np.int32), count),
+            weight=np.tile(np.array([0.9, 0.1], np.float32), count),
+            images=np.array([[x, y, z], [12.0 - x, y, z]]),
+            mirrors=np.array([np.eye(3), np.diag([-1.0, 1.0, 1.0])]),
+            num_reflections=np.array([0, 1], np.int8),
+            log_gain=np.zeros(2 * count, np.float16),
+            lit=np.ones(2 * count, np.float16),
+        )
+        parts[name] = replace(part, paths=paths)
+    return replace(table, parts=parts)

@@ -17,10 +17,13 @@ from rayfix_service.wire import InvalidReportError, parse_report, report_to_docu
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table
-from tests.service.fusion.quadrature.test_selection import mirrored
-from tests.support.tables.open_room import POSITIONS
+from tests.support.tables.open_room import POSITIONS, mirrored_room_table
 
-__all__ = ["mirrored"]  # the fixture
+
+@pytest.fixture(scope="module")
+def mirrored(tmp_path_factory: pytest.TempPathFactory) -> Table:
+    return mirrored_room_table(tmp_path_factory.mktemp("room"))
+
 
 STATION = Station(id="a", position=(0.0, 0.0, 0.0))
 SITE = SiteInfo(name="one", north=0.0, max_path_length=40.0, stations=(STATION,))

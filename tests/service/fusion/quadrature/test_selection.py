@@ -20,7 +20,7 @@ from rayfix_tables.errors import ReportError
 from rayfix_tables.paths import PathMap
 from rayfix_tables.site import Selection
 from rayfix_tables.table import Table
-from tests.support.tables.open_room import POSITIONS, direct_paths, open_room_table, room_space
+from tests.support.tables.open_room import POSITIONS, direct_paths, mirrored_room_table, open_room_table, room_space
 
 LENGTHS = np.array([8.0, 2.0, 4.0])
 
@@ -134,26 +134,7 @@ def test_weights_are_kept_for_the_rules_used_last() -> None:
 
 @pytest.fixture(scope="module")
 def mirrored(tmp_path_factory: pytest.TempPathFactory) -> Table:
-    """Return the open room with a second path to each place, by the wall at x = 6 m, without a loss."""
-    table = open_room_table(tmp_path_factory.mktemp("room") / "t.h5")
-    parts = {}
-    for name, part in table.parts.items():
-        assert part.paths is not None
-        count = len(part.paths)
-        x, y, z = POSITIONS[name]
-        paths = replace(
-            part.paths,
-            offsets=2 * part.paths.offsets,
-            sequence=np.tile(np.array([0, 1], np.int32), count),
-            weight=np.tile(np.array([0.9, 0.1], np.float32), count),
-            images=np.array([[x, y, z], [12.0 - x, y, z]]),
-            mirrors=np.array([np.eye(3), np.diag([-1.0, 1.0, 1.0])]),
-            num_reflections=np.array([0, 1], np.int8),
-            log_gain=np.zeros(2 * count, np.float16),
-            lit=np.ones(2 * count, np.float16),
-        )
-        parts[name] = replace(part, paths=paths)
-    return replace(table, parts=parts)
+    return mirrored_room_table(tmp_path_factory.mktemp("room"))
 
 
 PLACE = np.array([3.0, 4.0, 1.2])
