@@ -82,7 +82,7 @@ the code: `make reference`.
 """
 
 WINDOWS_MEASURED = """\
-| `[1.25, 5, 15]` | 37 s on two idle cores ([performance](performance.md)), so 74 s at most | 240 MB |
+| `[1.25, 5, 15]` | 37 s on two idle cores ([performance](performance.md)), so 74 s at most | 294 MB |
 | `[2.5, 10]` | 26 s | 73 MB |
 | `[5, 15]` | 12 s | 28 MB |"""
 """Measured by builds of `rayfix example` with these windows, one job and kernels that were compiled before."""
