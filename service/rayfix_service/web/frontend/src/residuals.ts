@@ -19,9 +19,12 @@ export interface Residual {
   difference: readonly string[];
   /** The largest of the differences in standard deviations; null where there is none. */
   sigmas: number | null;
+  /** What explains it. */
+  path: Explanation | undefined;
 }
 
 export interface ExplainedFix {
+  /** By station; of several paths of a station, by station and number of the measurement. */
   paths: Map<string, Explanation>;
   residuals: Residual[];
 }
@@ -33,20 +36,30 @@ interface LengthForm {
 
 export function explainFix(mirrors: Mirrors, site: Site, report: Report, fix: Fix, at: Vec3 | null): ExplainedFix {
   const stations = new Map(site.stations.map((s) => [s.id, s]));
+  const north = site.table.site.north_deg * DEG;
   const paths = new Map<string, Explanation>();
+  const several = new Map<number, Explanation>();
+  const offsets = new Map<string, number>();
   if (at !== null) {
-    for (const id of new Set(report.measurements.flatMap((m) => [m.station_id, m.reference_station_id ?? m.station_id]))) {
+    const { origin } = mirrors;
+    const placed = (place: Vec3): Vec3 => add(place, origin);
+    const pathOf: Find = (id, heard) => {
+      const from = sub(vec(stations.get(id)!.position), origin);
+      const most = site.table.site.max_path_length_m;
+      const path = explain(mirrors, from, sub(at, origin), heard, site.settings.max_reflections, most);
+      return path && { ...path, points: path.points.map(placed), crossings: path.crossings.map(placed) };
+    };
+    const single = report.measurements.filter((m) => m.type !== "path");
+    for (const id of new Set(single.flatMap((m) => [m.station_id, m.reference_station_id ?? m.station_id]))) {
       const station = stations.get(id);
       if (station === undefined) continue;
-      const mine = report.measurements.filter((m, n) => m.station_id === id && isGood(fix, n));
-      const heard = heardBy(station, mine, site.table.site.north_deg * DEG);
-      const most = site.table.site.max_path_length_m;
-      const { origin } = mirrors;
-      const [from, to] = [sub(vec(station.position), origin), sub(at, origin)];
-      const path = explain(mirrors, from, to, heard, site.settings.max_reflections, most);
-      if (path === null) continue;
-      const placed = (at: Vec3): Vec3 => add(at, origin);
-      paths.set(id, { ...path, points: path.points.map(placed), crossings: path.crossings.map(placed) });
+      const mine = report.measurements.filter((m, n) => m.type !== "path" && m.station_id === id && isGood(fix, n));
+      const path = pathOf(id, heardBy(station, mine, north));
+      if (path !== null) paths.set(id, path);
+    }
+    explainSeveral(report, fix, stations, north, pathOf, several, offsets);
+    for (const [n, path] of several) {
+      if (isGood(fix, n)) paths.set(`${report.measurements[n]!.station_id} ${n}`, path);
     }
   }
   const offset = clockOffset(report, paths);
@@ -58,10 +71,67 @@ export function explainFix(mirrors: Mirrors, site: Site, report: Report, fix: Fi
       used: outcome?.used ?? false,
       reason: outcome?.reason ?? "",
       outlierProbability: outcome?.outlier_probability ?? null,
-      ...difference(measurement, station, site.table.site.north_deg * DEG, paths, offset),
+      ...(measurement.type === "path"
+        ? pathDifference(measurement, station, north, several.get(n), offsets.get(clockOf(measurement) ?? "") ?? 0)
+        : difference(measurement, station, north, paths, offset)),
+      path: several.get(n) ?? paths.get(measurement.station_id),
     };
   });
   return { paths, residuals };
+}
+
+type Find = (station: string, heard: Heard) => Explanation | null;
+
+/** Whose clock the length of a measured path counts on, where its offset is unknown. */
+function clockOf(m: Measurement): string | null {
+  if (typeof m["toa_m"] === "number") return "";
+  return typeof m["delay_ns"] === "number" ? `of ${m.station_id}` : null;
+}
+
+/**
+ * Explain each of several paths of a station: by its direction and a length on a known clock first; the offsets of
+ * other clocks are the middle of what is left over then, and their lengths count in a second round.
+ */
+function explainSeveral(
+  report: Report,
+  fix: Fix,
+  stations: Map<string, StationInfo>,
+  north: number,
+  pathOf: Find,
+  several: Map<number, Explanation>,
+  offsets: Map<string, number>,
+): void {
+  const measured = [...report.measurements.entries()].filter(([, m]) => m.type === "path" && stations.has(m.station_id));
+  const left = new Map<string, number[]>();
+  for (const [n, m] of measured) {
+    const path = pathOf(m.station_id, heardOfPath(m, stations.get(m.station_id)!, north, 0));
+    if (path === null) continue;
+    several.set(n, path);
+    const clock = clockOf(m);
+    if (clock !== null && m.azimuth_deg !== undefined && isGood(fix, n)) {
+      left.set(clock, [...(left.get(clock) ?? []), lengthOf(m)!.value - path.length]);
+    }
+  }
+  for (const [clock, apart] of left) offsets.set(clock, apart.sort((a, b) => a - b)[apart.length >> 1]!);
+  for (const [n, m] of measured) {
+    const offset = offsets.get(clockOf(m) ?? "known");
+    if (offset === undefined) continue;
+    const path = pathOf(m.station_id, heardOfPath(m, stations.get(m.station_id)!, north, offset));
+    if (path !== null) several.set(n, path);
+  }
+}
+
+/** One measured path; its length counts where the clock's offset is known or not 0. */
+function heardOfPath(m: Measurement, station: StationInfo, north: number, offset: number): Heard {
+  const towards = m.azimuth_deg === undefined ? { azimuth: null, zenith: null } : sceneAngles(m, station, north);
+  const measured = clockOf(m) === null || offset !== 0 ? lengthOf(m) : null;
+  return {
+    ...towards,
+    azimuthStdev: (m.azimuth_stdev_deg ?? 1) * DEG,
+    zenithStdev: (m.zenith_stdev_deg ?? 1) * DEG,
+    length: measured === null ? null : measured.value - offset,
+    lengthStdev: measured?.stdev ?? 1,
+  };
 }
 
 function isGood(fix: Fix, index: number): boolean {
@@ -113,7 +183,7 @@ function heardBy(station: StationInfo, measurements: Measurement[], north: numbe
 function lengthOf(m: Measurement): LengthForm | null {
   const number = (key: string): number | null => (typeof m[key] === "number" ? m[key] : null);
   const stdev = number("stdev_m") ?? (number("stdev_ns") ?? 0) * METRES_PER_NANOSECOND;
-  const metres = number("range_m") ?? number("range_difference_m");
+  const metres = number("range_m") ?? number("range_difference_m") ?? number("toa_m");
   if (metres !== null) return { value: metres, stdev };
   const delay = number("delay_ns") ?? number("delay_difference_ns");
   if (delay !== null) return { value: delay * METRES_PER_NANOSECOND, stdev };
@@ -155,6 +225,29 @@ function difference(
   const expected = m.type === "tdoa" ? path.length - reference!.length : path.length + (m.type === "toa" ? offset : 0);
   const left = value - expected;
   return { text, difference: [signed(left, stdev, " m")], sigmas: Math.abs(left) / stdev };
+}
+
+function pathDifference(
+  m: Measurement,
+  station: StationInfo | undefined,
+  north: number,
+  path: Explanation | undefined,
+  offset: number,
+): Pick<Residual, "text" | "difference" | "sigmas"> {
+  const angle = m.azimuth_deg === undefined ? null : angleDifference(m, station, north, path);
+  const measured = lengthOf(m);
+  const text = [...(angle?.text ?? [])];
+  const difference = [...(angle?.difference ?? [])];
+  const sigmas = angle?.sigmas == null ? [] : [angle.sigmas];
+  if (measured !== null) {
+    text.push(withDeviation(measured.value, measured.stdev, " m"));
+    if (path) {
+      const left = measured.value - offset - path.length;
+      difference.push(signed(left, measured.stdev, " m"));
+      sigmas.push(Math.abs(left) / measured.stdev);
+    }
+  }
+  return { text, difference, sigmas: sigmas.length ? Math.max(...sigmas) : null };
 }
 
 function angleDifference(

@@ -87,4 +87,34 @@ describe("a fix explained", () => {
     ]);
     expect(residuals[0]!.sigmas).toBeCloseTo(0.5, 2);
   });
+
+  test.each(["range_m", "toa_m", "delay_ns"])("has a path for each of several that a station measured, by %s", (length) => {
+    const offset = length === "range_m" ? 0 : 71.5;
+    const ways: Vec3[] = [[3, 0, -1], [3, 5, -1], [3, -3, -1]]; // straight, by the walls y = 4 and y = 0
+    const measurements = ways.map((way): Measurement => {
+      const total = Math.hypot(...way) + offset;
+      const told = length === "delay_ns" ? { delay_ns: total / 0.299792458, stdev_ns: 1 } : { [length]: total, stdev_m: 0.3 };
+      return {
+        type: "path",
+        station_id: "bs1",
+        azimuth_deg: Math.atan2(way[1], way[0]) / DEG,
+        azimuth_stdev_deg: 1,
+        zenith_deg: Math.acos(way[2] / Math.hypot(...way)) / DEG,
+        zenith_stdev_deg: 1,
+        ...told,
+      };
+    });
+    const fix = { measurements: measurements.map((_, index) => ({ index, used: true, outlier_probability: 0 })) } as unknown as Fix;
+    const { paths, residuals } = explainFix(new Mirrors({ ...boxes([[0, 0, 0], [5, 4, 3]]), origin: [0, 0, 0] }), {
+      table: { name: "", table_id: "", software_version: "", num_components: 0, site: { name: "", north_deg: 0, max_path_length_m: 30 } },
+      stations: [station(STATION)],
+      settings: { simulation: false, max_reflections: 2, open_materials: [] },
+    }, { measurements }, fix, POSITION);
+    expect([...paths.keys()]).toEqual(["bs1 0", "bs1 1", "bs1 2"]);
+    expect(residuals.map((r) => r.path!.numReflections)).toEqual([0, 1, 1]);
+    for (const { difference, sigmas } of residuals) {
+      expect(difference).toHaveLength(3);
+      expect(sigmas).toBeLessThan(0.01);
+    }
+  });
 });

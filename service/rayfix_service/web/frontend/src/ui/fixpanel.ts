@@ -19,7 +19,7 @@ const MEANING = {
 
 const SOURCES = { stream: "live", posted: "posted here", simulated: "simulated", file: "from the file", log: "from the log" } as const;
 
-const KINDS: Record<string, string> = { aoa: "angle", pt: "range", toa: "arrival", tdoa: "difference", rssi: "strength" };
+const KINDS: Record<string, string> = { aoa: "angle", pt: "range", toa: "arrival", path: "path", tdoa: "difference", rssi: "strength" };
 
 /** Frames of angles, as docs/conventions.md names them. */
 const FRAMES = {
@@ -111,7 +111,7 @@ export class FixPanel {
 
   private measurements(explained: ExplainedFix | null): HTMLElement {
     const rows = h("tbody", {});
-    for (const residual of explained?.residuals ?? []) rows.append(...this.row(residual, explained!));
+    for (const residual of explained?.residuals ?? []) rows.append(...this.row(residual));
     return h(
       "div",
       {},
@@ -120,10 +120,10 @@ export class FixPanel {
     );
   }
 
-  private row(residual: Residual, explained: ExplainedFix): HTMLElement[] {
+  private row(residual: Residual): HTMLElement[] {
     const { measurement: m, sigmas } = residual;
-    const path = explained.paths.get(m.station_id);
-    const frame = m.type === "aoa" ? (m.frame ?? "scene") : undefined;
+    const { path } = residual;
+    const frame = m.type === "aoa" || m.type === "path" ? (m.frame ?? "scene") : undefined;
     const outlier = residual.outlierProbability ?? 0;
     const className = !residual.used ? "unused" : outlier > 0.5 ? "outlier" : "";
     const how = path ? wayOf(path) : "no path found";
