@@ -8,6 +8,7 @@ from rayfix.commands.arguments import (
     AddCommand,
     add_jobs_argument,
     add_progress_argument,
+    at_least_one,
     drop_count,
     seed_number,
 )
@@ -35,6 +36,9 @@ def add_commands(add: AddCommand) -> None:
     plan.add_argument("--threshold-m", type=float, default=1.0, metavar="M", help="largest useful error (default: 1)")
     plan.add_argument("--draws", type=int, default=4, help="reports from each square (default: 4)")
     plan.add_argument("--seed", type=seed_number, default=1, help="seed of positions and noise (default: 1)")
+    plan.add_argument(
+        "--paths", type=at_least_one, metavar="K", help="strongest paths that each station reports (default: one path)"
+    )
     add_progress_argument(plan)
     plan.add_argument("--json", action="store_true", help="print the map as JSON, one line for each table")
 
@@ -64,6 +68,7 @@ def _plan(options: argparse.Namespace) -> int:
         threshold=options.threshold_m,
         draws=options.draws,
         seed=options.seed,
+        paths=options.paths,
     )
     tables = [options.table, *([options.beside] if options.beside else [])]
     maps = plan_tables(tables, settings, options.output, progress=not options.no_progress)

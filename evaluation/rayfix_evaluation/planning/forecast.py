@@ -11,8 +11,18 @@ from numpy.typing import NDArray
 from rayfix_evaluation.drops.accuracy import clear_of_solids
 from rayfix_evaluation.drops.bound import information_bound
 from rayfix_evaluation.drops.simulate import Noise, Timing, fold_direction
+from rayfix_evaluation.planning.several_paths import StrongestPaths, strongest_paths
 from rayfix_evaluation.planning.station_mixture import AudiblePaths, audible_paths
-from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, Report, TimeDifference, TimeOfArrival
+from rayfix_service.fusion.measurements.report import (
+    Angle,
+    MeasuredPath,
+    Measurement,
+    Range,
+    Report,
+    TimeDifference,
+    TimeOfArrival,
+)
+from rayfix_service.fusion.quadrature.path_sets import MOST_MEASURED
 from rayfix_service.locator import Locator
 from rayfix_tables.errors import RayfixError
 from rayfix_tables.site import Station
@@ -22,6 +32,9 @@ Array = NDArray[np.float64]
 
 Progress = Callable[[int, int], None]
 """Called with the number of reports located so far, and the total number."""
+
+MOST_PATHS = 10
+"""Paths of a station that may be planned with."""
 
 _MARGIN = 0.06  # m; positions nearer to solids are left out
 _TRIES = 10  # candidate positions for each position that is drawn
@@ -48,6 +61,8 @@ class PlanSettings:
         Reports from each square, each from a different position in it and with different noise.
     seed : int
         Seed of positions and noise.
+    paths : int, optional
+        Strongest paths that each station reports; by default one, as the table's rule selects it.
 
     Raises
     ------
@@ -62,6 +77,7 @@ class PlanSettings:
     threshold: float = 1.0
     draws: int = 4
     seed: int = 1
+    paths: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
@@ -73,6 +89,10 @@ class PlanSettings:
             raise RayfixError(f"the height is {self.height} m; give the transmitters' z in the scene")
         if self.draws < 1:
             raise RayfixError(f"the number of draws is {self.draws}; give 1 or more")
+        if self.paths is not None and not 1 <= self.paths <= MOST_PATHS:
+            raise RayfixError(f"the number of paths is {self.paths}; give 1 to {MOST_PATHS}")
+        if self.paths is not None and self.timing == "tdoa":
+            raise RayfixError("several paths have no time differences; give their times as 'toa', on the unknown clock")
         if self.seed < 0:
             raise RayfixError(f"the seed is {self.seed}; give 0 or more")
         if self.timing != "none" and self.noise.range_stdev is None:
@@ -136,13 +156,26 @@ def forecast(table: Table, settings: PlanSettings, progress: Progress | None = N
     rng = np.random.default_rng(settings.seed)
     squares, places = draw_places(table, settings.height, settings.spacing, settings.draws, rng)
     stations = table.site.stations
+    if settings.paths is not None and settings.paths * len(stations) > MOST_MEASURED:
+        raise RayfixError(
+            f"{len(stations)} stations with {settings.paths} paths each are more than {MOST_MEASURED} paths in a "
+            f"report; give --paths {MOST_MEASURED // len(stations)} or less"
+        )
     noise = rng.standard_normal((len(places), len(stations), 3))
-    paths = [audible_paths(table.levels(station.id)[0], places - table.scene.origin) for station in stations]
+    inside = places - table.scene.origin
+    paths = [audible_paths(table.levels(station.id)[0], inside) for station in stations]
+    several = None if settings.paths is None else _several(table, inside, settings.paths)
     locator = Locator(table)
     bound, square, within = np.empty(len(places)), np.empty(len(places)), np.empty(len(places))
     for n in range(len(places)):
-        bound[n] = _bound(paths, n, settings)
-        square[n], within[n] = _outlook(locator, _measure(stations, paths, n, settings, noise[n]), settings.threshold)
+        if several is None:
+            bound[n] = _bound(paths, n, settings)
+            measurements = _measure(stations, paths, n, settings, noise[n])
+        else:
+            of_place = [found[n] for found in several]
+            bound[n] = _bound_of_several(of_place, settings)
+            measurements = _measure_several(stations, of_place, settings, rng)
+        square[n], within[n] = _outlook(locator, measurements, settings.threshold)
         if progress is not None:
             progress(n + 1, len(places))
     middles, first = np.unique(squares, axis=0, return_index=True)
@@ -225,6 +258,61 @@ def _bound(paths: Sequence[AudiblePaths], place: int, settings: PlanSettings) ->
         information += np.outer(vertical, vertical) / noise.zenith_stdev**2
         lengths.append(length)
     return information_bound(information, lengths, noise, timing=settings.timing)
+
+
+def _several(table: Table, places: Array, most: int) -> list[Sequence[StrongestPaths]]:
+    """Strongest paths from each station to places in the table's frame."""
+    found = []
+    for station in table.site.stations:
+        stored = table.parts[station.id].paths
+        if stored is None:
+            raise RayfixError("the table has no map of paths, as those of format 2 and older; build it again")
+        found.append(strongest_paths(stored, places, most))
+    return found
+
+
+def _bound_of_several(paths: Sequence[StrongestPaths], settings: PlanSettings) -> float:
+    """Bound of the paths that all stations report."""
+    noise = settings.noise
+    information = np.zeros((3, 3))
+    for found in paths:
+        for zenith, (_, horizontal, vertical) in zip(found.zenith, found.gradients, strict=True):
+            across = max(float(np.sin(zenith)), 1e-6) * noise.azimuth_stdev
+            information += np.outer(horizontal, horizontal) / across**2
+            information += np.outer(vertical, vertical) / noise.zenith_stdev**2
+    lengths = [gradient[0] for found in paths for gradient in found.gradients]
+    return information_bound(information, lengths, noise, timing=settings.timing)
+
+
+def _measure_several(
+    stations: Sequence[Station], paths: Sequence[StrongestPaths], settings: PlanSettings, rng: np.random.Generator
+) -> tuple[Measurement, ...]:
+    """Measure several paths of each station with noise."""
+    noise, timing = settings.noise, settings.timing
+    measurements: list[Measurement] = []
+    for station, found in zip(stations, paths, strict=True):
+        for path, error in zip(range(len(found.length)), rng.standard_normal((len(found.length), 3)), strict=True):
+            azimuth, zenith = fold_direction(
+                found.azimuth[path] + station.bias.azimuth + error[0] * noise.azimuth_stdev,
+                found.zenith[path] + station.bias.zenith + error[1] * noise.zenith_stdev,
+            )
+            length = None
+            if noise.range_stdev is not None and timing != "none":
+                offset = _CLOCK if timing == "toa" else 0.0
+                length = float(found.length[path] + station.bias.range + offset + error[2] * noise.range_stdev)
+            measurements.append(
+                MeasuredPath(
+                    station_id=station.id,
+                    azimuth=azimuth,
+                    azimuth_stdev=noise.azimuth_stdev,
+                    zenith=zenith,
+                    zenith_stdev=noise.zenith_stdev,
+                    length=length,
+                    stdev=None if length is None else noise.range_stdev,
+                    clock="ue" if timing == "toa" else "known",
+                )
+            )
+    return tuple(measurements)
 
 
 def _outlook(locator: Locator, measurements: tuple[Measurement, ...], threshold: float) -> tuple[float, float]:

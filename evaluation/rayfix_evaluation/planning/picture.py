@@ -229,6 +229,8 @@ def _title(table: Table, plan: PlanMap) -> str:
     azimuth, zenith = (f"{np.degrees(stdev):g}" for stdev in (noise.azimuth_stdev, noise.zenith_stdev))
     angles = f"angles to {azimuth} deg" if azimuth == zenith else f"azimuth to {azimuth} and zenith to {zenith} deg"
     times = "no times" if plan.settings.timing == "none" else f"{plan.settings.timing} to {noise.range_stdev:g} m"
+    if plan.settings.paths is not None:
+        times += f", {plan.settings.paths} paths"
     return (
         f"{table.site.name}, {table.path.name}: {angles}, {times}, {plan.settings.height:g} m high; "
         f"{plan.coverage:.1%} of fixes within {plan.settings.threshold:g} m"

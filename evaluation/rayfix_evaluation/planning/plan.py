@@ -30,6 +30,7 @@ def plan_settings(
     threshold: float,
     draws: int,
     seed: int,
+    paths: int | None = None,
 ) -> PlanSettings:
     """Make settings from arguments of the command line, in degrees and metres.
 
@@ -48,7 +49,14 @@ def plan_settings(
     except ValueError as error:
         raise RayfixError(str(error)) from error
     return PlanSettings(
-        height=height, noise=noise, timing=timing, spacing=spacing, threshold=threshold, draws=draws, seed=seed
+        height=height,
+        noise=noise,
+        timing=timing,
+        spacing=spacing,
+        threshold=threshold,
+        draws=draws,
+        seed=seed,
+        paths=paths,
     )
 
 
@@ -91,6 +99,7 @@ def plan_document(table: Table, plan: PlanMap) -> dict[str, Any]:
             "threshold_m": settings.threshold,
             "draws": settings.draws,
             "seed": settings.seed,
+            "paths": settings.paths,
         },
         "map": [
             {

@@ -98,6 +98,8 @@ def test_a_floor_without_free_places_is_refused(screen_table: Table) -> None:
         ({"threshold": float("nan")}, r"the threshold is nan m; it must be positive"),
         ({"height": float("inf")}, r"the height is inf m; give the transmitters' z in the scene"),
         ({"draws": 0}, r"the number of draws is 0; give 1 or more"),
+        ({"paths": 0}, r"the number of paths is 0; give 1 to 10"),
+        ({"paths": 2, "timing": "tdoa"}, r"several paths have no time differences; give their times as 'toa'"),
         ({"noise": replace(NOISE, range_stdev=None)}, r"the timing is 'pt', but the standard deviation of a range"),
     ],
 )
