@@ -19,7 +19,7 @@ from rayfix_service.fusion.product.prior import Prior, height_prior, uniform_pri
 from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.fusion.quadrature.engine import GridPosterior, Quadrature
 from rayfix_service.fusion.quadrature.observed import path_factor
-from rayfix_service.fusion.quadrature.sets import sort_paths
+from rayfix_service.fusion.quadrature.sets import sort_paths, span_of
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_tables.errors import ReportError
@@ -92,8 +92,14 @@ class Fusion:
         The estimate separates quick fixes from slow ones; it is infinite for a report that is slow in any case.
         """
         report = with_deviations(report, self.table.site)
-        if any(isinstance(measurement, MeasuredPath) for measurement in report.measurements):
-            return self._quadrature.seconds_of_paths(len(report.measurements))
+        by_station: dict[str, list[MeasuredPath]] = {}
+        for measurement in report.measurements:
+            if isinstance(measurement, MeasuredPath):
+                by_station.setdefault(measurement.station_id, []).append(measurement)
+        if by_station:
+            within = _within_db(report.selection)
+            spans = {name: span_of(paths, within) for name, paths in by_station.items()}
+            return self._quadrature.seconds_of_paths(spans, len(report.measurements))
         selections = selections_of(report, self.table.site)
         seconds = (
             self._quadrature.seconds(report, selections) if len(report.measurements) <= _MOST_MEASUREMENTS else None
@@ -191,8 +197,7 @@ class Fusion:
         for index, path in measured:
             if not has_gains(self.table, path.station_id):
                 raise ReportError(_NO_GAINS.format(path.station_id), path=("measurements", index))
-        within = selection.reach_db if selection is not None and selection.rule == "all" else REACH_DB["all"]
-        paths = sort_paths(measured, site, within_db=within, spurious_paths=self.settings.spurious_paths)
+        paths = sort_paths(measured, site, within_db=_within_db(selection), spurious_paths=self.settings.spurious_paths)
         observations = list(sorted_report.observations)
         unused = dict(sorted_report.unused) | paths.unused
         if not observations and not paths.indices:
@@ -261,3 +266,8 @@ class Fusion:
             contributing = {n for o in observations for n in o.differences}
             unused |= {n: unused_differences[n] for n in unused_differences.keys() - contributing}
         return observations, factors
+
+
+def _within_db(selection: Selection | None) -> float:
+    """How weak a measured path may be, dB."""
+    return selection.reach_db if selection is not None and selection.rule == "all" else REACH_DB["all"]

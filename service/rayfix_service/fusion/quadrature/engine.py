@@ -44,6 +44,9 @@ _FACTOR_SECONDS = 6e-4
 _SETS_SECONDS, _PATH_SECONDS = 1.5e-2, 2e-3
 """What a report of several paths of a station takes, and each of them, s."""
 
+_PREPARING_SECONDS = 1.5e-6
+"""What working out the weights of a rule takes, for each path of a station's map, s."""
+
 _POSITION = 3
 """Coordinates of a position: more measured numbers than that leave nothing open."""
 
@@ -150,12 +153,26 @@ class Quadrature:
                 known += 1
                 combinations += _num_terms(m) - 1
         slow = 1.0 if known > _POSITION else _OPEN
-        return _LEAST_SECONDS + _FACTOR_SECONDS * len(report.measurements) * combinations * slow
+        new = [name for name, rule in selections.items() if not self._reweighted.has_selected(name, rule)]
+        fix = _LEAST_SECONDS + _FACTOR_SECONDS * len(report.measurements) * combinations * slow
+        return fix + self._preparing_seconds(new)
 
-    @staticmethod
-    def seconds_of_paths(count: int) -> float:
-        """Estimate how long a fix of so many measurements takes of which some are of paths, s."""
-        return _SETS_SECONDS + _PATH_SECONDS * count
+    def seconds_of_paths(self, spans: Mapping[str, float], count: int) -> float:
+        """Estimate how long a fix of so many measurements takes of which some are of paths, s.
+
+        Parameters
+        ----------
+        spans : mapping of str to float, dB
+            How weak the paths of each station may be.
+        count : int
+        """
+        new = [name for name, span in spans.items() if not self._reweighted.has_detected(name, span)]
+        return _SETS_SECONDS + _PATH_SECONDS * count + self._preparing_seconds(new)
+
+    def _preparing_seconds(self, names: Sequence[str]) -> float:
+        """Estimate how long it takes to work out the weights of stations under a rule that is not kept, s."""
+        maps = [self._table.parts[name].paths for name in names if name in self._table.parts]
+        return sum(_PREPARING_SECONDS * len(paths) for paths in maps if paths is not None)
 
     def posterior(
         self,
@@ -182,17 +199,21 @@ class Quadrature:
         longest, origin = self._table.site.max_path_length, self._table.scene.origin
         at = {name: np.subtract(part.station.position, origin) for name, part in self._table.parts.items()}
         factors = [path_factor(each, self._settings, longest, at[each.station_id]) for each in observations]
-        stations = [self._station(each.station_id, selections.get(each.station_id)) for each in observations]
-        sets = NO_SETS if paths is None else self._sets(paths)
+        stations = []
+        for each in observations:
+            stop.check()
+            stations.append(self._station(each.station_id, selections.get(each.station_id)))
+        sets = NO_SETS if paths is None else self._sets(paths, stop)
         leaves, omitted = integrate(self.tree, stations, factors, prior, self._limits, stop, sets)
         log_all_outlier = sum(float(np.log(factor.outlier)) for factor in factors) + sets.log_all_spurious
         return GridPosterior(leaves=leaves, log_all_outlier=log_all_outlier, omitted=omitted)
 
-    def _sets(self, paths: SortedPaths) -> PathSets:
+    def _sets(self, paths: SortedPaths, stop: Stop) -> PathSets:
         groups = []
         for group in paths.groups:
             sets = []
             for name, within_db, measured in group:
+                stop.check()
                 stored = self._table.parts[name].paths
                 assert stored is not None
                 sets.append(StationSet(self._reweighted.detected(name, stored, self.tree, within_db), measured))

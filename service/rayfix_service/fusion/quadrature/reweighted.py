@@ -30,6 +30,14 @@ class Reweighted:
         """Return how many are kept."""
         return len(self._kept)
 
+    def has_selected(self, name: str, selection: Selection) -> bool:
+        """Whether the weights of a station and rule are there."""
+        return (name, selection) in self._kept
+
+    def has_detected(self, name: str, within_db: float) -> bool:
+        """Whether a station's probabilities of detection are there."""
+        return (name, within_db) in self._kept
+
     def selected(self, name: str, paths: PathMap, tree: BlockTree, selection: Selection) -> StationPaths:
         """Paths of a station by their probability to be the one that it reports."""
         return self._found((name, selection), paths, tree, lambda wide: selected_paths(wide, selection))

@@ -12,7 +12,9 @@ For a set of paths (:mod:`rayfix_service.fusion.quadrature.path_sets`) p_k is th
 """
 
 import math
+from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,7 +52,7 @@ def detected_paths(paths: PathMap, within_db: float) -> BlockPaths:
     voxel, gain, audible = _audible(paths, within_db)
     below = _DB * (_highest(paths, gain)[voxel] - gain)
     # Falls a little with the gain where it would be flat, so that the strongest paths come first.
-    return _sorted(paths, voxel, _MOST_DETECTED * audible * np.exp(-_FALL * below))
+    return _sorted(paths, _MOST_DETECTED * audible * np.exp(-_FALL * below))
 
 
 def selected_paths(paths: PathMap, selection: Selection) -> BlockPaths:
@@ -67,11 +69,14 @@ def selected_paths(paths: PathMap, selection: Selection) -> BlockPaths:
         highest = _highest(paths, gain)
         weight = paths.lit.astype(np.float64) * np.exp(selection.exponent * (gain - highest[voxel]))
     elif selection.rule == "first":
-        weight = audible * _none_before(paths, voxel, audible)
+        length = _lengths(paths, voxel)
+        if len(paths.excess):
+            length += paths.excess
+        weight = audible * none_before(paths.offsets, length, audible)
     else:
         weight = audible
     total = np.bincount(voxel, weight, len(paths.offsets) - 1)
-    return _sorted(paths, voxel, weight / np.maximum(total, 1e-300)[voxel])
+    return _sorted(paths, weight / np.maximum(total, 1e-300)[voxel])
 
 
 def _audible(paths: PathMap, within_db: float) -> tuple[NDArray[np.int64], Array, Array]:
@@ -101,27 +106,52 @@ def _highest(paths: PathMap, value: Array) -> Array:
     return found
 
 
-def _none_before(paths: PathMap, voxel: NDArray[np.int64], audible: Array) -> Array:
-    """Probability that no shorter path to the voxel is audible."""
-    length = _lengths(paths, voxel)
-    if len(paths.excess):
-        length += paths.excess
-    order = np.lexsort((length, voxel))
-    silent = np.log1p(-np.minimum(audible[order], 1.0 - 1e-9))
-    before = np.concatenate([[0.0], np.cumsum(silent)])
-    found = np.empty(len(order))
-    found[order] = np.exp(before[:-1] - before[paths.offsets[voxel[order]]])
+@numba.njit(cache=True, nogil=True)
+def none_before(offsets: Any, length: Any, audible: Any) -> Any:
+    """Probability that no shorter path to the voxel is audible; of equal ones, the first counts as shorter."""
+    found = np.ones(len(length))
+    for voxel in range(len(offsets) - 1):
+        for path in range(offsets[voxel], offsets[voxel + 1]):
+            for other in range(offsets[voxel], offsets[voxel + 1]):
+                if length[other] < length[path] or (length[other] == length[path] and other < path):
+                    found[path] *= 1.0 - audible[other]
     return found
 
 
-def _sorted(paths: PathMap, voxel: NDArray[np.int64], weight: Array) -> BlockPaths:
+@numba.njit(cache=True, nogil=True)
+def heaviest_first(offsets: Any, weight: Any, least: Any) -> Any:
+    """Sort the paths to each voxel by weight, the heaviest first, without those of no more than ``least``.
+
+    Returns
+    -------
+    new_offsets : ndarray of int64, shape (n_voxels + 1,)
+    order : ndarray of int64
+        Of the paths that are left.
+    """
+    new_offsets = np.zeros(len(offsets), np.int64)
+    order = np.empty(len(weight), np.int64)
+    total = 0
+    for voxel in range(len(offsets) - 1):
+        begin = total
+        for path in range(offsets[voxel], offsets[voxel + 1]):
+            if weight[path] <= least:
+                continue
+            at = total
+            while at > begin and weight[order[at - 1]] < weight[path]:
+                order[at] = order[at - 1]
+                at -= 1
+            order[at] = path
+            total += 1
+        new_offsets[voxel + 1] = total
+    return new_offsets, order[:total].copy()
+
+
+def _sorted(paths: PathMap, weight: Array) -> BlockPaths:
     """Paths of new weights, heaviest first."""
-    kept = np.flatnonzero(weight > _LEAST)
-    order = kept[np.lexsort((-weight[kept], voxel[kept]))]
-    counts = np.bincount(voxel[order], minlength=len(paths.offsets) - 1)
+    offsets, order = heaviest_first(paths.offsets, weight, _LEAST)
     passes = len(paths.excess) > 0
     return BlockPaths(
-        offsets=np.concatenate([[0], np.cumsum(counts)]),
+        offsets=offsets,
         sequence=paths.sequence[order],
         weight=weight[order].astype(np.float32),
         excess=paths.excess[order] if passes else np.zeros(0, np.float32),

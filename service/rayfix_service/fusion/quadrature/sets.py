@@ -176,7 +176,7 @@ def sort_paths(
         for name in names:
             rows, station = by_station[name], site.station_by_id[name]
             own = _measured_set(rows, station, site.max_path_length, spurious_paths, first, len(indices))
-            group.append((name, _span_of(rows, within_db), own))
+            group.append((name, span_of([path for _, path, _ in rows], within_db), own))
             indices += [(name, index) for index, _, _ in rows]
         groups.append(group)
     return SortedPaths(groups, indices, unused)
@@ -198,9 +198,17 @@ def _clock_of(rows: Sequence[tuple[int, MeasuredPath, Direction]]) -> str:
     return clock or "known"
 
 
-def _span_of(rows: Sequence[tuple[int, MeasuredPath, Direction]], within_db: float) -> float:
-    """How weak a path may be, dB: from the powers, in steps, which are few rules to keep."""
-    powers = [path.power_db for _, path, _ in rows if path.power_db is not None]
+def span_of(paths: Sequence[MeasuredPath], within_db: float) -> float:
+    """How weak a path of a station may be, dB: from the powers, in steps, which are few rules to keep.
+
+    Parameters
+    ----------
+    paths : sequence of MeasuredPath
+        Of one station.
+    within_db : float
+        Where fewer than two have a power.
+    """
+    powers = [path.power_db for path in paths if path.power_db is not None]
     if len(powers) < 2:
         return within_db
     steps = math.ceil((max(powers) - min(powers)) / _SPAN_STEP) + 1

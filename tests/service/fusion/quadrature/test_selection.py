@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.quadrature.blocks import BlockPaths, BlockTree
 from rayfix_service.fusion.quadrature.reweighted import Reweighted
-from rayfix_service.fusion.quadrature.selection import detected_paths, selected_paths
+from rayfix_service.fusion.quadrature.selection import detected_paths, heaviest_first, none_before, selected_paths
 from rayfix_service.fusion.quadrature.spread import spread_paths
 from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.fusion.stopping import FixStoppedError, Stop
 from rayfix_service.locator import Locator
 from rayfix_service.wire import InvalidReportError, parse_report, report_to_document
 from rayfix_tables.errors import ReportError
@@ -119,6 +120,49 @@ def test_spreading_against_dictionaries() -> None:
         own = slice(found.offsets[voxel], found.offsets[voxel + 1])
         actual = dict(zip(found.sequence[own].tolist(), found.lit[own].astype(float), strict=True))
         assert actual == pytest.approx(expected, rel=2e-3)
+
+
+def test_kernels_against_numpy() -> None:
+    rng = np.random.default_rng(8)
+    offsets = np.concatenate([[0], np.cumsum(rng.integers(0, 6, 40))])
+    count = int(offsets[-1])
+    voxel = np.repeat(np.arange(40), np.diff(offsets))
+    weight = rng.random(count)
+    kept = np.flatnonzero(weight > 0.2)
+    expected = kept[np.lexsort((-weight[kept], voxel[kept]))]
+    new_offsets, order = heaviest_first(offsets, weight, 0.2)
+    np.testing.assert_array_equal(order, expected)
+    np.testing.assert_array_equal(np.diff(new_offsets), np.bincount(voxel[expected], minlength=40))
+    length, audible = rng.integers(1, 5, count).astype(float), rng.random(count)
+    silent = [
+        np.prod([1.0 - audible[m] for m in np.flatnonzero(voxel == voxel[n]) if (length[m], m) < (length[n], n)])
+        for n in range(count)
+    ]
+    np.testing.assert_allclose(none_before(offsets, length, audible), silent, rtol=1e-12)
+
+
+def test_a_rule_that_is_not_worked_out_yet_is_no_quick_fix(mirrored: Table) -> None:
+    """The first report of a rule kept the event loop busy for seconds."""
+    locator = Locator(mirrored)
+    path = {"type": "path", "station_id": "a", "azimuth_deg": 45.0, "azimuth_stdev_deg": 1.0}
+    for document in (reflected(rule="any"), reflected(rule="any", within_db=33.0), {"measurements": [path]}):
+        report = parse_report(document)
+        before = locator.seconds(report)
+        locator.locate(report)
+        after = locator.seconds(report)
+        paths = mirrored.parts["a"].paths
+        assert paths is not None
+        assert before - after == pytest.approx(1.5e-6 * len(paths), rel=1e-6)
+
+
+def test_a_stop_is_seen_between_the_weights_of_stations(mirrored: Table) -> None:
+    stop = Stop()
+    stop.set()
+    locator, report = Locator(mirrored), parse_report(reflected(rule="first"))
+    before = locator.seconds(report)
+    with pytest.raises(FixStoppedError):
+        locator.locate(report, stop=stop)
+    assert locator.seconds(report) == before  # nothing was worked out
 
 
 def test_weights_are_kept_for_the_rules_used_last() -> None:
