@@ -100,7 +100,7 @@ coverage: $(VENV)/.done
 
 # In a real browser; what it showed is kept in browser-artefacts/.
 browser: $(VENV)/.done viewer
-	$(BIN)/python -m pytest tests/browser
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile tests/browser
 
 lint: $(VENV)/.done
 	$(BIN)/ruff format --check .

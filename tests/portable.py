@@ -24,7 +24,12 @@ ROOT = Path(__file__).resolve().parents[1]
 NUMERICAL = ("tests/tables", "tests/offline", "tests/service/fusion", "tests/service/tracking", "tests/evaluation")
 
 # Where threads share the work, or libraries do that have kernels of their own for several.
-OF_THREADS = ("tests/offline/fit", "tests/offline/rays", "tests/service/fusion", "tests/service/tracking")
+OF_THREADS = (
+    "tests/offline/fit",
+    "tests/offline/rays",
+    "tests/service/fusion/product",
+    "tests/service/fusion/posterior",
+)
 
 # By the architecture, OpenBLAS's names of two older cores.
 CORES = {"x86_64": ("Nehalem", "Sandybridge"), "aarch64": ("ARMV8", "CORTEXA57")}

@@ -175,8 +175,10 @@ class Locator:
         with_likelihood : bool
             Whether :meth:`fuse` is to keep the likelihood, which is a second product for a report with a known height.
         """
-        products = 2 if with_likelihood and report.height is not None else 1
-        return products * self._fusion.seconds(report)
+        seconds = self._fusion.seconds(report)
+        if with_likelihood and report.height is not None:
+            seconds += self._fusion.seconds(replace(report, height=None))
+        return seconds
 
     def warm_up(self) -> None:
         """Compile the kernels and prepare reports without angles, by locating a report of each kind."""

@@ -10,6 +10,8 @@ from rayfix.cli import main
 from rayfix_offline.build import build_table
 from rayfix_tables.table import Table
 
+pytestmark = pytest.mark.slow
+
 SITE = """
 [site]
 name = "lab"

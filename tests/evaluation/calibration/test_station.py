@@ -13,6 +13,8 @@ from rayfix_tables.errors import ReportError
 from rayfix_tables.geometry.angles import angles_of, direction, local_to_scene
 from rayfix_tables.site import SiteInfo, Station
 
+pytestmark = pytest.mark.slow
+
 POSITIONS = {"a": (5.0, 4.0, 2.9), "b": (0.3, 0.3, 2.0), "c": (9.7, 7.7, 2.0)}
 """A station under the middle of the ceiling, which sees all round, and two in corners of a room of 10 x 8 x 3 m."""
 

@@ -27,7 +27,9 @@ from rayfix_tables.table import Table
 Array = NDArray[np.float64]
 
 UE = np.array([1.6, 3.4, 1.1])
-NO_OUTLIERS = FusionSettings(outlier_probability=1e-9, component_floor=1e-9, beam_width=200_000)
+NO_OUTLIERS = FusionSettings(
+    outlier_probability=1e-9, unmodelled_probability=0.0, component_floor=1e-9, beam_width=200_000
+)
 STDEV = float(np.deg2rad(1.0))
 
 

@@ -239,7 +239,7 @@ def test_the_estimate_is_hardly_below_the_time(locator: Locator) -> None:
     factors: list[float] = []
 
     def cost(report: Report) -> float:
-        estimate = locator.seconds(report)
+        estimate = locator.seconds(report, with_likelihood=True)
         if estimate > ServiceSettings.quick_fix_seconds:
             raise ReportError("slow")
         begin = time.thread_time()

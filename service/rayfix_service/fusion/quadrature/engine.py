@@ -41,6 +41,12 @@ _LEAST_SECONDS = 1e-3
 _FACTOR_SECONDS = 6e-4
 """What each measurement takes, s."""
 
+_RANGES_ALONE = 3.0
+"""By how much more a report of ranges alone takes, whose shells are wide and thin."""
+
+_MANY_SHARE, _MANY_FROM = 0.2, 4
+"""By how much more each measurement takes for each one beyond so many."""
+
 _SETS_SECONDS, _PATH_SECONDS = 1.5e-2, 2e-3
 """What a report of several paths of a station takes, and each of them, s."""
 
@@ -153,8 +159,12 @@ class Quadrature:
                 known += 1
                 combinations += _num_terms(m) - 1
         slow = 1.0 if known > _POSITION else _OPEN
+        if not any(isinstance(m, Angle) for m in report.measurements):
+            slow = max(slow, _RANGES_ALONE)
         new = [name for name, rule in selections.items() if not self._reweighted.has_selected(name, rule)]
-        fix = _LEAST_SECONDS + _FACTOR_SECONDS * len(report.measurements) * combinations * slow
+        # Where many contradict each other, there are many places to resolve.
+        many = 1.0 + _MANY_SHARE * max(len(report.measurements) - _MANY_FROM, 0)
+        fix = _LEAST_SECONDS + _FACTOR_SECONDS * len(report.measurements) * combinations * slow * many
         return fix + self._preparing_seconds(new)
 
     def seconds_of_paths(self, spans: Mapping[str, float], count: int) -> float:
