@@ -2,6 +2,7 @@
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,10 @@ from rayfix_service.fusion.measurements.report import (
     HEAVY_TAILED,
     Angle,
     ErrorModel,
+    Frame,
     Height,
     LogRange,
+    MeasuredPath,
     Measurement,
     Range,
     Report,
@@ -163,3 +166,21 @@ def test_the_extremes_of_the_interface_get_a_sound_fix(locator: Locator, stdev_d
     for timing in (ranges, times, [*ranges, *times]):
         report = Report(measurements=(*angles, *timing))
         assert_sound(locator.locate(report), report)
+
+
+@pytest.mark.parametrize("zenith", [0.0, 6.5e-192, 1e-12, np.pi])
+@pytest.mark.parametrize("frame", ["scene", "lcs", "north"])
+@pytest.mark.parametrize("stdev", [1e-4, 0.02, 1.0, 5.0])
+def test_a_direction_at_a_pole_has_a_sound_fix(locator: Locator, zenith: float, frame: Frame, stdev: float) -> None:
+    """Straight up or down, densities over azimuth and zenith were divided by a sine of zero."""
+    angle = {"azimuth": np.pi / 4.0, "azimuth_stdev": stdev, "zenith": zenith, "zenith_stdev": stdev}
+    for station in locator.table.site.stations:
+        measured = Angle(station_id=station.id, frame=frame, **angle)
+        for others in ((), (Range(station_id=station.id, path_length=2.0, stdev=0.5),)):
+            fix = locator.locate(Report(measurements=(measured, *others)))
+            assert np.isfinite(fix.log_evidence)
+            assert all(np.isfinite(each.position).all() for each in fix.candidates)
+        if locator.table.parts[station.id].paths is not None:
+            path = MeasuredPath(station_id=station.id, frame=frame, **angle)
+            several = Report(measurements=(path, replace(path, azimuth=1.0)))
+            assert np.isfinite(locator.locate(several).log_evidence)

@@ -92,8 +92,9 @@ def look_up(levels: tuple[Level, ...], measured: Direction) -> Lookup:
             if largest <= SUM_RATIO**2 * _limit(level):
                 summed = level
                 break
-        correlation = measured.cov[0, 1] / np.sqrt(measured.cov[0, 0] * measured.cov[1, 1])
-        if abs(correlation) > _LEAST_CORRELATION:
+        # Next to a pole, an azimuth of the array's own frame may have no variance left in the scene's.
+        whole = math.sqrt(var_azimuth * var_zenith)
+        if abs(covariance) > _LEAST_CORRELATION * whole > 0.0:
             ellipse = sum_of_ellipse(summed.grid, summed.window, measured.azimuth, measured.zenith, measured.cov)
             return Lookup(level=summed, **ellipse._asdict())
     elif measured.azimuth is not None and measured.local is not None:

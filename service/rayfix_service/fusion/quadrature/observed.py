@@ -17,6 +17,9 @@ from rayfix_service.fusion.settings import FusionSettings
 _NO_INDICATION = LineOfSightWeights(0.0, 0.0)
 _SCENE = np.eye(3)
 
+_POLE = 1e-4
+"""Measured zeniths are at least this far from the poles, rad: there the density of directions would be infinite."""
+
 
 def path_factor(
     observation: Observation, settings: FusionSettings, max_path_length: float, station: NDArray[np.float64]
@@ -58,7 +61,7 @@ def measured_direction(direction: Direction) -> tuple[NDArray[np.float64], float
     angles = _angles(direction)
     azimuth = 0.0 if angles is None else angles.azimuth
     to_measured = _about_z(-azimuth) @ (_SCENE if angles is None else angles.to_scene.T)
-    zenith = math.nan if angles is None or angles.zenith is None else angles.zenith
+    zenith = math.nan if angles is None or angles.zenith is None else min(max(angles.zenith, _POLE), math.pi - _POLE)
     cov = direction.cov if angles is None else angles.cov
     return np.ascontiguousarray(to_measured), zenith, np.array([cov[0, 0], cov[0, 1], cov[1, 1]])
 
