@@ -5,10 +5,8 @@ import json
 from pathlib import Path
 
 from rayfix.commands.arguments import AddCommand, add_progress_argument, positive
-from rayfix.commands.logs import add_log_arguments, log_reading
+from rayfix.commands.logs import add_source_arguments, log_reading
 from rayfix.extras import needs_extra
-
-_INPUTS = ("native", "nrppa", "silabs", "ublox")
 
 
 def add_commands(add: AddCommand) -> None:
@@ -26,24 +24,7 @@ def add_commands(add: AddCommand) -> None:
         "-o", "--site", type=Path, required=True, metavar="SITE.toml", help="site file to write, with what was found"
     )
     calibrate.add_argument("--pictures", type=Path, metavar="DIR", help="folder for pictures of the errors")
-    calibrate.add_argument("--format", choices=_INPUTS, default="native", help="format of the logs (default: native)")
-    calibrate.add_argument(
-        "--station", action="append", default=[], metavar="NAME=STATION", help="the station with the name NAME in a log"
-    )
-    calibrate.add_argument(
-        "--stdev", type=float, metavar="DEG", help="standard deviation of the angles of u-blox lines (default: 10)"
-    )
-    calibrate.add_argument(
-        "--tails",
-        type=float,
-        nargs=2,
-        metavar=("SHARE", "SCALE"),
-        help="tails of the angles of u-blox lines (default: 0.2 3)",
-    )
-    calibrate.add_argument(
-        "--height", type=float, nargs=2, metavar=("Z", "STDEV"), help="known height (z) of the targets, m"
-    )
-    add_log_arguments(calibrate)
+    add_source_arguments(calibrate)
     calibrate.add_argument(
         "--longest-gap",
         type=positive,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rayfix.commands.arguments import AddCommand, add_jobs_argument, add_progress_argument, at_least_one
-from rayfix.commands.logs import add_log_arguments, log_reading
+from rayfix.commands.logs import add_source_arguments, log_reading
 from rayfix.errors import ReportError
 from rayfix.extras import needs_extra
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from rayfix_evaluation.recorded.comparison import Comparison, TableEvidence
     from rayfix_service.fusion.measurements.report import Height, Report
 
-_INPUTS = ("native", "nrppa", "silabs", "ublox")
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
@@ -35,24 +34,7 @@ def add_commands(add: AddCommand) -> None:
         metavar="N",
         help="take at most so many reports, spread evenly over the logs (default: 4000)",
     )
-    compare.add_argument("--format", choices=_INPUTS, default="native", help="format of the logs (default: native)")
-    compare.add_argument(
-        "--station", action="append", default=[], metavar="NAME=STATION", help="the station with the name NAME in a log"
-    )
-    compare.add_argument(
-        "--stdev", type=float, metavar="DEG", help="standard deviation of the angles of u-blox lines (default: 10)"
-    )
-    compare.add_argument(
-        "--tails",
-        type=float,
-        nargs=2,
-        metavar=("SHARE", "SCALE"),
-        help="tails of the angles of u-blox lines (default: 0.2 3)",
-    )
-    compare.add_argument(
-        "--height", type=float, nargs=2, metavar=("Z", "STDEV"), help="known height (z) of the targets, m"
-    )
-    add_log_arguments(compare)
+    add_source_arguments(compare)
     add_jobs_argument(compare, "processes that locate the reports")
     add_progress_argument(compare)
     compare.add_argument("--json", action="store_true", help="print the figures as JSON")

@@ -16,10 +16,8 @@ from rayfix.commands.arguments import (
     hub_settings,
 )
 from rayfix.commands.broker import PASSWORD_VARIABLE
-from rayfix.commands.logs import add_log_arguments, angle_errors, check_one_report, log_reading
+from rayfix.commands.logs import INPUTS, add_log_arguments, angle_errors, check_one_report, log_reading
 from rayfix.extras import needs_extra
-
-_INPUTS = ("native", "nrppa", "silabs", "ublox")
 
 
 def add_commands(add: AddCommand) -> None:
@@ -37,7 +35,7 @@ def add_commands(add: AddCommand) -> None:
         help="write the fixes of all reports to this file: .jsonl, .csv, .geojson or .parquet; "
         "without it, one report is located and printed",
     )
-    locate.add_argument("--format", choices=_INPUTS, default="native", help="format of the reports (default: native)")
+    locate.add_argument("--format", choices=INPUTS, default="native", help="format of the reports (default: native)")
     add_output_arguments(locate)
     add_confidence_argument(locate)
     locate.add_argument(

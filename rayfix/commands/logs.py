@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from rayfix_tables.table import Table
 
 
+INPUTS = ("native", "nrppa", "silabs", "ublox")
+"""Formats of reports."""
+
+
 def add_log_arguments(command: argparse.ArgumentParser) -> None:
     """Add the options for how logs are read."""
     command.add_argument(
@@ -38,6 +42,28 @@ def add_log_arguments(command: argparse.ArgumentParser) -> None:
         default=None,
         help="what joined measurements of a station become; none keeps them all (default: median)",
     )
+
+
+def add_source_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the options for what logs are of, and for how they are read."""
+    command.add_argument("--format", choices=INPUTS, default="native", help="format of the logs (default: native)")
+    command.add_argument(
+        "--station", action="append", default=[], metavar="NAME=STATION", help="the station with the name NAME in a log"
+    )
+    command.add_argument(
+        "--stdev", type=float, metavar="DEG", help="standard deviation of the angles of u-blox lines (default: 10)"
+    )
+    command.add_argument(
+        "--tails",
+        type=float,
+        nargs=2,
+        metavar=("SHARE", "SCALE"),
+        help="tails of the angles of u-blox lines (default: 0.2 3)",
+    )
+    command.add_argument(
+        "--height", type=float, nargs=2, metavar=("Z", "STDEV"), help="known height (z) of the targets, m"
+    )
+    add_log_arguments(command)
 
 
 def angle_errors(options: argparse.Namespace) -> "AngleErrors | None":

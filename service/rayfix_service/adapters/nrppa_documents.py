@@ -186,42 +186,37 @@ class AdditionalPath(WireModel):
     extensions: Any = not_used("iE-Extensions")
 
 
-class UlRtoa(WireModel):
+class TimeOfPaths(WireModel):
+    """A time measurement that may have further paths."""
+
+    additional_paths: list[AdditionalPath] | None = Field(
+        default=None, alias="additionalPathList", min_length=1, max_length=2, description="an array of 1 or 2 paths"
+    )
+    more_paths: list[AdditionalPath] | None = Field(
+        default=None,
+        alias="ExtendedAdditionalPathList",
+        min_length=1,
+        max_length=8,
+        description="an array of 1 to 8 paths",
+    )
+
+
+class UlRtoa(TimeOfPaths):
     """UL-RTOAMeasurement."""
 
     model_config = ConfigDict(title="UL-RTOAMeasurement")
 
     time: TimeChoice = Field(alias="uLRTOAmeas")
-    additional_paths: list[AdditionalPath] | None = Field(
-        default=None, alias="additionalPathList", min_length=1, max_length=2, description="an array of 1 or 2 paths"
-    )
-    more_paths: list[AdditionalPath] | None = Field(
-        default=None,
-        alias="ExtendedAdditionalPathList",
-        min_length=1,
-        max_length=8,
-        description="an array of 1 to 8 paths",
-    )
     timing_group: Any = not_used("TRP-Rx-TEGInformation")
     extensions: Any = not_used("iE-extensions")
 
 
-class GnbRxTx(WireModel):
+class GnbRxTx(TimeOfPaths):
     """GNB-RxTxTimeDiff."""
 
     model_config = ConfigDict(title="GNB-RxTxTimeDiff")
 
     time: TimeChoice = Field(alias="rxTxTimeDiff")
-    additional_paths: list[AdditionalPath] | None = Field(
-        default=None, alias="additionalPathList", min_length=1, max_length=2, description="an array of 1 or 2 paths"
-    )
-    more_paths: list[AdditionalPath] | None = Field(
-        default=None,
-        alias="ExtendedAdditionalPathList",
-        min_length=1,
-        max_length=8,
-        description="an array of 1 to 8 paths",
-    )
     timing_group: Any = not_used("TRPTEGInformation")
     extensions: Any = not_used("iE-Extensions")
 

@@ -65,7 +65,7 @@ def locate_many(locator: Locator, count: int, seed: int) -> list[Fix]:
 @pytest.mark.slow
 def test_positions_of_very_many_reports_lie_in_the_free_space(locator: Locator) -> None:
     """Means of hypotheses lay in walls or outside with a known height there, of inconsistent fixes above all."""
-    fixes = locate_many(locator, 5_000, 2)
+    fixes = locate_many(locator, 10_000, 2)
     for fix in fixes:
         assert_sound(fix, locator.table.scene.free_space)
     assert {fix.status for fix in fixes} == {"ok", "ambiguous", "inconsistent", "insufficient"}
