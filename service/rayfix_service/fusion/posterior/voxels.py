@@ -51,9 +51,9 @@ def is_free_position(free: Any, origin: Any, voxel_size: Any, position: Any) -> 
 def nearest_free(position: Any, cov: Any, origin: Any, voxel_size: Any, free: Any) -> Any:
     """Move a position, in place, to the nearest one in the free space; False when there is no free space.
 
-    Blocks of voxels are searched from the nearest on, until none that is left can hold a nearer position. The
-    Mahalanobis distance is at least the Euclidean one divided by the largest standard deviation, which is at most the
-    root of the trace.
+    Blocks of voxels are searched from the nearest on, until none that is left can hold a nearer position. With the
+    block's centre c and the normal n = cov^-1 (c - position) of the ellipsoid through it, no x of the block is nearer
+    than n . (x - position) / sqrt(n . cov n) (the inequality of Cauchy and Schwarz).
 
     Parameters
     ----------
@@ -67,18 +67,21 @@ def nearest_free(position: Any, cov: Any, origin: Any, voxel_size: Any, free: An
     if not cholesky(cov, lower):
         return False
     invert(lower, precision)
-    trace = cov[0, 0] + cov[1, 1] + cov[2, 2]
     nx, ny, nz = free.shape
     bx, by, bz = (nx + _BLOCK - 1) // _BLOCK, (ny + _BLOCK - 1) // _BLOCK, (nz + _BLOCK - 1) // _BLOCK
     bound = np.empty(bx * by * bz)
-    for b in range(len(bound)):
-        square = 0.0
-        for i, n in enumerate((b // (by * bz), b // bz % by, b % bz)):
-            low = origin[i] + voxel_size * _BLOCK * n
-            square += (min(max(position[i], low), low + voxel_size * _BLOCK) - position[i]) ** 2
-        bound[b] = square / trace
-    least = np.inf
+    half = 0.5 * voxel_size * _BLOCK
     apart, best = np.empty(3), np.empty(3)
+    for b in range(len(bound)):
+        for i, n in enumerate((b // (by * bz), b // bz % by, b % bz)):
+            apart[i] = origin[i] + half * (2 * n + 1) - position[i]
+        square, reach = 0.0, 0.0
+        for i in range(3):
+            normal = precision[i, 0] * apart[0] + precision[i, 1] * apart[1] + precision[i, 2] * apart[2]
+            square += normal * apart[i]
+            reach += abs(normal) * half
+        bound[b] = (square - reach) ** 2 / square if square > reach else 0.0
+    least = np.inf
     # Just inside the voxels: their faces may be another's.
     inside = 1e-6 * voxel_size
     for b in np.argsort(bound):
