@@ -54,7 +54,10 @@ _PREPARING_SECONDS = 1.5e-6
 """What working out the weights of a rule takes, for each path of a station's map, s."""
 
 _POSITION = 3
-"""Coordinates of a position: more measured numbers than that leave nothing open."""
+"""Coordinates of a position: more numbers than that, of as many quantities, leave nothing open."""
+
+_TELLING = 0.6
+"""An angle whose error may be of a greater standard deviation, rad, leaves the direction open."""
 
 _OPEN = 6.0
 """By how many times a fix takes longer where something is left open."""
@@ -144,7 +147,7 @@ class Quadrature:
         A report that leaves the position open along a line or a surface takes long, as does one of many combinations of
         errors.
         """
-        known, combinations = 0 if report.height is None else 1, 1
+        known, combinations = {("", "height")} if report.height is not None else set[tuple[str, str]](), 1
         for m in report.measurements:
             part = self._table.parts.get(m.station_id)
             if part is None or part.paths is None or not isinstance(m, Angle | Range | LogRange):
@@ -153,12 +156,16 @@ class Quadrature:
                 stdevs = [m.azimuth_stdev] if m.zenith_stdev is None else [m.azimuth_stdev, m.zenith_stdev]
                 if not selections and min(stdevs) <= WIDE_RATIO * part.levels[0].window:
                     return None
-                known += len(stdevs)
-                combinations += len(spreads(m.error_model)) - 1
+                of_angles = zip(("azimuth", "zenith"), stdevs, strict=False)
+                scales = [spread.scale for spread in spreads(m.error_model)]
+                known |= {(m.station_id, name) for name, stdev in of_angles if max(scales) * stdev < _TELLING}
+                combinations += len(scales) - 1
             else:
-                known += 1
+                if not selections and isinstance(m, Range) and m.stdev < _FINEST_LENGTH:
+                    return None
+                known.add((m.station_id, "length"))
                 combinations += _num_terms(m) - 1
-        slow = 1.0 if known > _POSITION else _OPEN
+        slow = 1.0 if len(known) > _POSITION else _OPEN
         if not any(isinstance(m, Angle) for m in report.measurements):
             slow = max(slow, _RANGES_ALONE)
         new = [name for name, rule in selections.items() if not self._reweighted.has_selected(name, rule)]
