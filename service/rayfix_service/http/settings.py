@@ -86,7 +86,8 @@ class ServiceSettings:
         Whether the header ``X-Forwarded-Prefix`` names that path. Only for services that a proxy alone can reach.
     quick_fix_seconds : float
         A fix that takes no longer than this, by an estimate from its report, is made on the event loop; the others, the
-        slow ones, are made in threads.
+        slow ones, are made in threads. One that takes over twice as long on the event loop is stopped there, and made
+        anew in a thread.
     fix_seconds : float
         Time limit of a slow fix.
     slow_fix_threads, slow_fixes_waiting : int

@@ -28,6 +28,7 @@ from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.feed_relay import FeedRelay
 from rayfix_service.http.answering.freed_memory import FreedMemory
 from rayfix_service.http.answering.locating import Answerer
+from rayfix_service.http.answering.quick_work import QuickWork
 from rayfix_service.http.answering.served_tables import ServedTable, Tables
 from rayfix_service.http.answering.slow_work import SlowWork
 from rayfix_service.http.answering.table_cache import TableCache
@@ -164,6 +165,7 @@ def create_app(
             relay = FeedRelay(feed, settings.runtime_folder)
             keeping.append(asyncio.create_task(relay.keep()))
         freed = FreedMemory() if settings.own_process else None
+        quick_work = QuickWork(2.0 * settings.quick_fix_seconds)
         slow_work = SlowWork(
             threads=settings.slow_fix_threads,
             waiting=settings.slow_fixes_waiting,
@@ -185,6 +187,7 @@ def create_app(
                     answerer = Answerer(
                         metrics=metrics,
                         feed=feed,
+                        quick_work=quick_work,
                         slow_work=slow_work,
                         hub=hub,
                         quick_seconds=settings.quick_fix_seconds,
@@ -214,6 +217,7 @@ def create_app(
             for task in keeping:
                 task.cancel()
             await asyncio.wait(keeping)
+            quick_work.close()
             slow_work.close()
             if freed is not None:
                 freed.close()

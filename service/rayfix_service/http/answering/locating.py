@@ -3,6 +3,7 @@
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from time import perf_counter
@@ -15,12 +16,14 @@ from rayfix_service.adapters.formats import write
 from rayfix_service.adapters.omlox_hub import OmloxHub
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.fix import Fix
-from rayfix_service.fusion.stopping import NEVER, Stop
+from rayfix_service.fusion.posterior.fused import Fused
+from rayfix_service.fusion.stopping import FixStoppedError, Stop
 from rayfix_service.http.answering.feed import FixFeed
 from rayfix_service.http.answering.freed_memory import FreedMemory
+from rayfix_service.http.answering.quick_work import QuickWork
 from rayfix_service.http.answering.response_options import ResponseOptions
 from rayfix_service.http.answering.served_tables import ServedTable
-from rayfix_service.http.answering.slow_work import SlowWork
+from rayfix_service.http.answering.slow_work import SlowWork, Stoppable
 from rayfix_service.http.problems import ProblemError, internal_problem, problem_document, report_problem
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.telemetry.metrics import Metrics
@@ -100,8 +103,10 @@ class Answerer:
         To add to.
     feed : FixFeed
         To publish fixes in.
+    quick_work : QuickWork
+        Makes fixes on the event loop.
     slow_work : SlowWork
-        Threads for what takes longer, by its estimate, than ``quick_seconds``.
+        Threads for what takes longer, by its estimate, than ``quick_seconds``, and for what turns out to.
     hub : OmloxHub or None
         To send positions to.
     quick_seconds : float
@@ -116,6 +121,7 @@ class Answerer:
 
     metrics: Metrics
     feed: FixFeed
+    quick_work: QuickWork
     slow_work: SlowWork
     hub: OmloxHub | None
     quick_seconds: float = ServiceSettings.quick_fix_seconds
@@ -187,8 +193,7 @@ class Answerer:
         quick = locator.seconds(report, with_likelihood=follows) <= self.quick_seconds
         start = perf_counter()
         try:
-            fuse = partial(locator.fuse, with_likelihood=follows)
-            fused = fuse(report, stop=NEVER) if quick else await self.slow_work.locate(fuse, report)
+            fused = await self._fuse(partial(locator.fuse, with_likelihood=follows), report, quick)
             seconds = perf_counter() - start
             self.metrics.fix_done(fused.fix, seconds, table=table.name, site=table.site, report=report)
             track = table.tracker.follow(fused) if follows else None
@@ -199,6 +204,13 @@ class Answerer:
         if track is not None:
             self.metrics.track_done(track.state)
         return Located(await self._explained(locator, report, fused.fix, perf_counter() - start), track, seconds)
+
+    async def _fuse(self, fuse: Stoppable[Report, Fused], report: Report, quick: bool) -> Fused:
+        """Make a fix on the event loop where it is quick, in a thread where it is not or was not."""
+        if quick:
+            with suppress(FixStoppedError):
+                return self.quick_work.do(lambda stop: fuse(report, stop=stop))
+        return await self.slow_work.locate(fuse, report)
 
     async def _explained(self, locator: Locator, report: Report, fix: Fix, spent: float) -> Fix:
         """Look in a thread for what may be wrong with the site, where a fix is inconsistent and no other work waits.
