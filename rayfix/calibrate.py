@@ -32,6 +32,9 @@ from rayfix_tables.table import Table
 _MOST_REPORTS = 4000
 """Reports that a calibration takes; of more, some that are spread evenly over the logs."""
 
+_MARK = "# Written by rayfix calibrate"
+"""What a site file begins with that may be replaced by another calibration."""
+
 Progress = Callable[[str, int, int], None]
 
 
@@ -83,7 +86,7 @@ def calibrate_logs(
     table : Table
     logs : sequence of pathlib.Path
     output : pathlib.Path
-        Site file to write; the scene that it names is that of the table's site file.
+        Site file to write, new or of another calibration; the scene that it names is that of the table's site file.
     reading : Reading
     truth_path : pathlib.Path, optional
         True positions; without them, deviations alone are found.
@@ -102,6 +105,7 @@ def calibrate_logs(
     """
     if not output.parent.is_dir():
         raise ReportError(f"there is no folder {output.parent}; make it first")
+    _check_free(output)
     truth = None if truth_path is None else read_truth(truth_path, longest_gap=longest_gap)
     progress("reading", 0, 0)
     held_out = None
@@ -122,7 +126,7 @@ def calibrate_logs(
     evidence = compare_evidence(used, table, calibration.site)
     document = calibrated_document(table.site, dict(calibration.stations))
     parse_site(document, source=str(output))  # what is written can be read
-    _write(output, _in_rows(tomli_w.dumps(document)))
+    _write(output, f"{_MARK}, from {len(used)} reports.\n\n{_in_rows(tomli_w.dumps(document))}")
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
         draw_errors(calibration, pictures)
@@ -178,6 +182,19 @@ def _in_rows(text: str) -> str:
     return re.sub(
         r"\[\n((?:\s+[-+.\deE]+,\n)+)\s*\]", lambda found: f"[{', '.join(found[1].replace(',', '').split())}]", text
     )
+
+
+def _check_free(path: Path) -> None:
+    """Refuse a file that someone wrote by hand."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            mine = file.readline().startswith(_MARK)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise ReportError(f"{path} cannot be written ({error.strerror}); give another file") from error
+    if not mine:
+        raise ReportError(f"{path} is there and was not written by rayfix calibrate; give the name of a new file")
 
 
 def _write(path: Path, text: str) -> None:

@@ -24,10 +24,8 @@ def print_log_run(run: "LogRun", output: Path, *, as_json: bool) -> None:
     for line in run.first_problems[:_LISTED]:
         print(line, file=sys.stderr)
     if summary.problems:
-        more = summary.problems - min(len(run.first_problems), _LISTED)
-        others = f"and {more} more" if more else "all of them"
-        count = "1 entry" if summary.problems == 1 else f"{summary.problems} entries"
-        print(f"{count} without a fix: {others} in {run.problems_path}", file=sys.stderr)
+        count = "1 entry was" if summary.problems == 1 else f"{summary.problems} entries were"
+        print(f"{count} left out; {run.problems_path} lists them with the reasons", file=sys.stderr)
     if as_json:
         print(json.dumps(summary.document() | {"output": str(output), "resumed": run.resumed}, indent=2))
         return

@@ -58,6 +58,8 @@ def locate_file(
         body = report_path.read_bytes()
     except OSError as error:
         raise ReportError(f"{report_path} cannot be read ({error.strerror}); give a file with a report") from error
+    if input_format == "native" and holds_lines(body):
+        raise ReportError(f"{report_path} holds more than one report; add -o FIXES.jsonl, which locates logs")
     table = open_checked(table_path)
     check_stations(stations or {}, table.parts)
     locator = Locator(table)
@@ -89,3 +91,9 @@ def locate_file(
     except ReportError as error:
         raise ReportError(f"{report_path}: {error}", path=error.path) from error
     return answers
+
+
+def holds_lines(body: bytes) -> bool:
+    """Whether a file that was taken for a report is a log with a report in each line."""
+    lines = [line for line in body.splitlines() if line.strip()]
+    return len(lines) > 1 and all(line.lstrip().startswith(b"{") and line.rstrip().endswith(b"}") for line in lines[:2])

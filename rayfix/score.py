@@ -85,6 +85,8 @@ def score_fixes(
         radii = [math.nan if use_track else _number(fix.get(f"radius_{round(100 * p)}_m")) for p in RADII]
         rows.append((position, at[0], radii, fix["status"], int(float(fix["num_used"])), at[1]))
     if not rows:
+        if use_track and not timeless + elsewhere:
+            raise ReportError(f"no fix of {fixes_path} has a track; locate the log by rayfix locate --track")
         raise ReportError(
             f"no fix of {fixes_path} has a position at a time that {truth_path} knows: {timeless} have no time, "
             f"{elsewhere} are of other times, {without_position} have no position; check times and target_id of both"
@@ -156,7 +158,8 @@ def score_lines(score: Score) -> list[str]:
             for label, key in (("mean", "mean"), ("50 %", "p50"), ("90 %", "p90"))
         )
         circles = ", ".join(f"{float(p):.0%} circle {c['holds']:.0%}" for p, c in group["circles"].items())
-        lines.append(f"{name}: {group['fixes']} fixes of {group['places']} places: {figures}; held by {circles or '-'}")
+        held = f"; held by {circles}" if circles else ""
+        lines.append(f"{name}: {group['fixes']} fixes of {group['places']} places: {figures}{held}")
     left_out = document["left_out"]
     if any(left_out.values()):
         lines.append(

@@ -401,10 +401,18 @@ def read_site(path: str | Path) -> SiteFile:
     except OSError as error:
         raise SiteError(f"{path} cannot be read ({error.strerror}); give a TOML site file") from error
     except UnicodeDecodeError as error:
-        raise SiteError(f"{path} is not UTF-8 text; give a TOML site file") from error
+        raise SiteError(f"{path} is not UTF-8 text; {_wanted(path)}") from error
     except tomllib.TOMLDecodeError as error:
-        raise SiteError(f"{path} is not valid TOML: {error}{_hint(error)}") from error
+        remedy = _hint(error) if path.suffix.lower() == ".toml" else f"; {_wanted(path)}"
+        raise SiteError(f"{path} is not valid TOML: {error}{remedy}") from error
     return parse_site(document, source=str(path))
+
+
+def _wanted(path: Path) -> str:
+    """Say what to give, if it was a scene perhaps."""
+    if path.suffix.lower() == ".toml":
+        return "give a TOML site file"
+    return f'give a TOML site file; one for this scene has [site] scene = "{path.name}", and stations'
 
 
 def _hint(error: tomllib.TOMLDecodeError) -> str:

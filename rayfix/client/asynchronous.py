@@ -102,6 +102,11 @@ class AsyncClient:
         ----------
         report : Mapping or rayfix.Report
             A mapping has the form of the JSON that ``POST /v1/positions`` takes.
+
+        Raises
+        ------
+        ReportError
+            When a number of a ``rayfix.Report`` is out of its range, before anything is sent.
         """
         return await self._ask(position_call(report, self.settings.position_query), fix_answer)
 
@@ -115,7 +120,12 @@ class AsyncClient:
         Returns
         -------
         list of (FixAnswer or ProblemError)
-            In the order of the reports. The error of a report that cannot be used is returned, not raised.
+            In the order of the reports. The error of a report that the service cannot use is returned, not raised.
+
+        Raises
+        ------
+        ReportError
+            When a number of a ``rayfix.Report`` is out of its range, before the report is sent.
         """
         answers: list[FixAnswer | ProblemError] = []
         for count, call in batch_calls(reports, self.settings.position_query):

@@ -13,7 +13,15 @@ from urllib.parse import urlencode
 
 from rayfix.client.models import FixAnswer, fix_answer
 from rayfix.client.retries import RetryPolicy, is_temporary
-from rayfix.errors import AnswerError, ClientError, ProblemError, ProblemField, RefusedReportError, UnreachableError
+from rayfix.errors import (
+    AnswerError,
+    ClientError,
+    ProblemError,
+    ProblemField,
+    RefusedReportError,
+    ReportError,
+    UnreachableError,
+)
 
 T = TypeVar("T")
 
@@ -145,11 +153,20 @@ def reason_of(error: Exception) -> str:
 
 
 def report_bytes(report: Any) -> bytes:
-    """Write a report: a mapping of the JSON that ``POST /v1/positions`` takes, or a ``rayfix.Report``."""
-    if not isinstance(report, Mapping):
-        from rayfix_service.wire import report_to_document  # a caller with such a report has this package
+    """Write a report: a mapping of the JSON that ``POST /v1/positions`` takes, or a ``rayfix.Report``.
 
-        report = report_to_document(report)
+    Raises
+    ------
+    ReportError
+        When a number of a ``rayfix.Report`` is out of its range. Once it is JSON, radians are degrees, and degrees that
+        were given for radians would pass for an angle.
+    """
+    if not isinstance(report, Mapping):
+        # A caller with such a report has this package.
+        from rayfix_service.fusion.measurements.checks import check_report
+        from rayfix_service.wire import report_to_document
+
+        report = report_to_document(check_report(report))
     return json.dumps(report, separators=(",", ":")).encode()
 
 
@@ -165,12 +182,21 @@ def position_call(report: Any, query: Mapping[str, str]) -> Call:
 def batch_calls(
     reports: Iterable[Any], query: Mapping[str, str], message_format: str | None = None
 ) -> Iterator[tuple[int, Call]]:
-    """Split reports or messages into batches that the service accepts; yields calls and numbers of reports."""
+    """Split reports or messages into batches that the service accepts; yields calls and numbers of reports.
+
+    Raises
+    ------
+    ReportError
+        As :func:`report_bytes`; the message says which report it is.
+    """
     path = "/v1/positions/batch" if message_format is None else f"/v1/positions/{_named(message_format)}/batch"
     batch: list[bytes] = []
     size = 0
-    for report in reports:
-        text = report_bytes(report)
+    for number, report in enumerate(reports):
+        try:
+            text = report_bytes(report)
+        except ReportError as error:
+            raise ReportError(f"reports[{number}]: {error}", path=("reports", number, *error.path)) from None
         if batch and (len(batch) == BATCH_REPORTS or size + len(text) > BATCH_BYTES):
             yield len(batch), _batch_call(path, batch, query)
             batch, size = [], 0

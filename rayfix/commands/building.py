@@ -7,7 +7,10 @@ import sys
 from pathlib import Path
 
 from rayfix.commands.arguments import AddCommand, add_jobs_argument, add_progress_argument, mass_share
+from rayfix.errors import BuildError
 from rayfix.extras import needs_extra
+
+_TABLES = (".h5", ".hdf5")
 
 
 def add_commands(add: AddCommand) -> None:
@@ -63,6 +66,9 @@ def _build(options: argparse.Namespace) -> int:
 
     from rayfix.console import print_build_summary
     from rayfix.progress import build_progress
+
+    if options.output.suffix.lower() not in _TABLES:
+        raise BuildError(f"{options.output} is not a valid name of a table; end it in {_TABLES[0]}")
 
     with build_progress(enabled=not options.no_progress) as progress:
         summary = build_table(

@@ -177,22 +177,22 @@ def _below(each: "TableEvidence", found: "Comparison") -> str:
 
 
 def _verdict(found: "Comparison") -> str:
-    """Say which table is right, if the log tells."""
+    """Say which table is ahead, if the log tells."""
     from rayfix_evaluation.recorded.comparison import LEAST_REPORTS
 
     best = found.best
     others = [each for each in found.tables if each is not best]
     if found.count < LEAST_REPORTS:
         reports = "1 report is" if found.count == 1 else f"{found.count} reports are"
-        return f"{reports} too few to tell which table is right; give a log of {LEAST_REPORTS} or more"
+        return f"{reports} too few to tell which table is the better one; give a log of {LEAST_REPORTS} or more"
     alike = [each for each in others if not each.is_worse(found.count)]
     if alike:
         names = ", ".join(str(each.table.path) for each in [best, *alike])
         worse = [str(each.table.path) for each in others if each not in alike]
         rest = f"; {', '.join(worse)} explain{'s' if len(worse) == 1 else ''} it worse" if worse else ""
-        return f"the log does not tell which of {names} is right{rest}"
+        return f"the log does not tell which of {names} is the better one{rest}"
     nearest = max(others, key=lambda each: each.difference)
     return (
-        f"{best.table.path} is right: it explains a report better than {nearest.table.path} by "
-        f"{-nearest.difference:.2f} ± {nearest.difference_error:.2f} nats"
+        f"{best.table.path} is ahead: it explains a report better than {nearest.table.path} by "
+        f"{-nearest.difference:.2f} ± {nearest.difference_error:.2f} nats; both may be wrong"
     )

@@ -2,10 +2,13 @@
 
 import argparse
 from pathlib import Path
+from typing import Literal
 
 from rayfix.commands.arguments import AddCommand, add_jobs_argument
 from rayfix.extras import needs_extra
 from rayfix.own_command import own_command
+
+_EXAMPLES: tuple[Literal["hall", "office"], ...] = ("hall", "office")
 
 
 def add_commands(add: AddCommand) -> None:
@@ -18,9 +21,9 @@ def add_commands(add: AddCommand) -> None:
     example.add_argument(
         "example",
         nargs="?",
-        choices=("hall", "office"),
-        default="hall",
-        help="a hall full of machines (default), or an office whose walls let signals through",
+        choices=_EXAMPLES,
+        help="a hall full of machines, or an office whose walls let signals through (default: the one that the folder "
+        "is named after, or the hall)",
     )
     example.add_argument("folder", type=Path, metavar="DIR", help="folder, created if necessary")
 
@@ -36,7 +39,9 @@ def _example(options: argparse.Namespace) -> int:
     with needs_extra("offline"):
         from rayfix.example.files import write_example
 
-        site = write_example(options.folder, example=options.example)
-    table = options.folder / f"{options.example}.h5"
+        named = next((name for name in _EXAMPLES if name == options.folder.name), _EXAMPLES[0])
+        example = options.example or named
+        site = write_example(options.folder, example=example)
+    table = options.folder / f"{example}.h5"
     print(f"Wrote {site} with its scene and a report. Next: {own_command()} build {site} -o {table}")
     return 0

@@ -10,6 +10,7 @@ from rayfix.commands.arguments import (
     add_progress_argument,
     at_least_one,
     drop_count,
+    positive,
     seed_number,
 )
 from rayfix.extras import needs_extra
@@ -21,20 +22,22 @@ def add_commands(add: AddCommand) -> None:
     plan.add_argument("table", type=Path, metavar="T.h5", help="table of the site")
     plan.add_argument("-o", "--output", type=Path, required=True, metavar="MAP.png", help="picture: .png, .svg or .pdf")
     plan.add_argument("--height", type=float, required=True, metavar="Z", help="height (z) of the targets, m")
-    plan.add_argument("--azimuth-stdev-deg", type=float, default=1.0, metavar="DEG", help="(default: 1)")
-    plan.add_argument("--zenith-stdev-deg", type=float, metavar="DEG", help="(default: as the azimuth)")
+    plan.add_argument("--azimuth-stdev-deg", type=positive, default=1.0, metavar="DEG", help="(default: 1)")
+    plan.add_argument("--zenith-stdev-deg", type=positive, metavar="DEG", help="(default: as the azimuth)")
     plan.add_argument("--times", choices=("none", "pt", "toa", "tdoa"), default="none", help="(default: none)")
     plan.add_argument(
         "--range-stdev-m",
-        type=float,
+        type=positive,
         default=0.5,
         metavar="M",
         help="standard deviation of times, as length (default: 0.5)",
     )
     plan.add_argument("--beside", type=Path, metavar="OTHER.h5", help="table of the site with a station added or moved")
-    plan.add_argument("--spacing-m", type=float, default=0.5, metavar="M", help="side of the squares (default: 0.5)")
-    plan.add_argument("--threshold-m", type=float, default=1.0, metavar="M", help="largest useful error (default: 1)")
-    plan.add_argument("--draws", type=int, default=4, help="reports from each square (default: 4)")
+    plan.add_argument("--spacing-m", type=positive, default=0.5, metavar="M", help="side of the squares (default: 0.5)")
+    plan.add_argument(
+        "--threshold-m", type=positive, default=1.0, metavar="M", help="largest useful error (default: 1)"
+    )
+    plan.add_argument("--draws", type=at_least_one, default=4, help="reports from each square (default: 4)")
     plan.add_argument("--seed", type=seed_number, default=1, help="seed of positions and noise (default: 1)")
     plan.add_argument(
         "--paths", type=at_least_one, metavar="K", help="strongest paths that each station reports (default: one path)"

@@ -153,7 +153,7 @@ def _locate_logs(options: argparse.Namespace) -> int:
             table, options.reports, options.fixes, task=task, reading=reading, jobs=options.jobs, progress=progress
         )
     print_log_run(run, options.fixes, as_json=options.json)
-    return 0
+    return 0 if run.summary.fixes else 1
 
 
 def _mqtt(options: argparse.Namespace) -> int:

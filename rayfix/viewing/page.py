@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rayfix.errors import ViewError
+from rayfix.locate import holds_lines
 from rayfix_service.locator import Locator
 from rayfix_service.web.assets import INDEX, STATIC, viewer_is_built
 from rayfix_service.web.glb import write_glb
@@ -94,7 +95,13 @@ def read_reports(path: Path) -> list[Mapping[str, Any]]:
         When the file has no report; the message names the file.
     """
     try:
-        document = read_json(path.read_bytes())
+        body = path.read_bytes()
+        if holds_lines(body):
+            raise ReportError(
+                "it holds more than one report; locate the log by rayfix locate -o FIXES.jsonl, and show it by --fixes "
+                "FIXES.jsonl"
+            )
+        document = read_json(body)
     except OSError as error:
         raise ReportError(f"{path} cannot be read ({error.strerror}); give a file with a report") from error
     except ReportError as error:

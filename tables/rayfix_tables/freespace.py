@@ -1,6 +1,7 @@
 """The positions where a UE can be: a voxel map of the building's free space."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,20 @@ class FreeSpace:
     def volume(self) -> float:
         """Volume of the free space, m3."""
         return float(np.count_nonzero(self.free)) * self.voxel_size**3
+
+    @cached_property
+    def largest_stdev(self) -> float:
+        """Standard deviation, m, along the longest axis of a position that may be anywhere in the free space."""
+        volume = max(np.count_nonzero(self.free), 1)
+        cov = np.zeros((3, 3))
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            share = np.count_nonzero(self.free, axis=3 - i - j) / volume
+            x, y = (np.arange(n) for n in share.shape)
+            x, y = x - share.sum(axis=1) @ x, y - share.sum(axis=0) @ y
+            cov[i, j] = cov[j, i] = x @ share @ y
+            cov[i, i], cov[j, j] = share.sum(axis=1) @ x**2, share.sum(axis=0) @ y**2
+        # Within a voxel it may be anywhere as well.
+        return self.voxel_size * float(np.sqrt(np.linalg.eigvalsh(cov)[-1] + 1.0 / 12.0))
 
     def moved(self, by: NDArray[np.float64]) -> "FreeSpace":
         """Return the map translated by a vector of shape (3,), m."""

@@ -44,6 +44,19 @@ def test_a_fix_has_what_the_service_answers(service_url: str, report: dict[str, 
     assert omlox["provider_id"] == report["target_id"]
 
 
+def test_degrees_are_not_taken_for_radians(service_url: str):
+    """An azimuth of 70 rad went out as 4010.7 degrees, and came back as a fix."""
+    angle = rayfix.Angle(station_id="bs1", azimuth=70.0, azimuth_stdev=0.02)
+    wrong = rayfix.Report(measurements=(angle,))
+    right = rayfix.Report(measurements=(rayfix.Range(station_id="bs1", path_length=7.0, stdev=1.0),))
+    with rayfix.Client(service_url) as client:
+        with pytest.raises(ReportError, match=r"azimuth is 70\.0; .*, in radians"):
+            client.locate(wrong)
+        with pytest.raises(ReportError, match=r"reports\[1\]: .*azimuth") as found:
+            client.locate_batch([right, wrong])
+    assert found.value.path == ("reports", 1, "measurements", 0, "azimuth")
+
+
 def test_a_target_is_followed(service_url: str, report: dict[str, Any]):
     with rayfix.Client(service_url, track=True) as client:
         fixes = [client.locate({**report, "timestamp": f"2026-01-31T10:00:00.{n}Z"}) for n in range(3)]

@@ -7,7 +7,7 @@ import pytest
 
 from rayfix_offline.build import build_table
 from rayfix_offline.scene.room import room_scene
-from rayfix_offline.site import OFF_WALL, parse_site
+from rayfix_offline.site import OFF_WALL, parse_site, read_site
 from rayfix_offline.site_sections import RoomSection
 from rayfix_offline.twin.twin import prepare_twin
 from rayfix_tables.errors import SiteError
@@ -71,6 +71,31 @@ def test_stations_on_walls_are_moved_off_and_said_to_be(tmp_path: Path) -> None:
     (finding,) = [f for f in twin.findings if "wall" in f.message]
     assert finding.severity == "warning"
     assert "middle, corner: on a wall of the room, moved off it by 1 mm" in finding.message
+
+
+def warnings_of(text: str, folder: Path) -> dict[str, str]:
+    path = folder / "site.toml"
+    path.write_text(text, encoding="utf-8")
+    return {found.kind: found.message for found in prepare_twin(read_site(path), folder).findings}
+
+
+def test_materials_that_count_for_nothing_are_said(tmp_path: Path) -> None:
+    """Tables with and without materials were the same, and a name that does not exist passed."""
+    constant = warnings_of(SITE, tmp_path)
+    assert "not looked up: 'concrete', 'wood'" in constant["material"]
+    by_material = SITE.replace("[propagation]", '[propagation]\nreflection = "itu"')
+    assert "not looked up" not in warnings_of(by_material, tmp_path)["material"]
+    assert "'wod' unknown" in warnings_of(by_material.replace('"wood"', '"wod"'), tmp_path)["material"]
+    assert "material" not in warnings_of(SITE.replace('walls = "concrete"\nfloor = "wood"', ""), tmp_path)
+
+
+def test_sizes_in_centimetres_and_short_paths_are_said(tmp_path: Path) -> None:
+    plain = warnings_of(SITE, tmp_path)
+    assert not {"unit", "short paths"} & set(plain)
+    large = warnings_of(SITE.replace("[6.0, 5.0, 2.8]", "[600.0, 500.0, 280.0]"), tmp_path)
+    assert "size_m is in metres" in large["unit"]
+    short = warnings_of(SITE.replace("max_path_length_m = 20.0", "max_path_length_m = 5.0"), tmp_path)
+    assert "'middle', 'corner'; give 8.3 at least" in short["short paths"]
 
 
 @pytest.mark.parametrize(

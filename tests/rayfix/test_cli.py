@@ -143,6 +143,33 @@ def test_locate_takes_and_gives_other_formats(
     assert "station 'A1' is not a pair; give NAME=STATION" in one_line(err)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "scene"), [(["office"], "office"), (["hall", "office"], "hall"), (["desks"], "hall")]
+)
+def test_an_example_is_the_one_that_is_named(
+    arguments: list[str],
+    scene: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """`rayfix example office` wrote the hall into a folder 'office'."""
+    monkeypatch.chdir(tmp_path)
+    status, out, _ = run(capsys, "example", *arguments)
+    assert status == 0
+    folder = tmp_path / arguments[-1]
+    assert {path.stem for path in folder.iterdir()} == {scene, "site", "report"}
+    assert f"{scene}.h5" in out
+
+
+def test_a_scene_is_no_site_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    scene = tmp_path / "room.obj"
+    scene.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", encoding="utf-8")
+    status, _, err = run(capsys, "check", scene)
+    assert status == 2
+    assert 'scene = "room.obj"' in one_line(err)
+
+
 def test_the_example_spares_what_is_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert run(capsys, "example", tmp_path)[0] == 0
     files = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -250,6 +277,15 @@ def test_build_writes_a_table_and_a_summary(capsys: pytest.CaptureFixture[str], 
         (["serve", "{table}", "--cors-origin", "maps.example.com"], r"is not an origin; give scheme, host and port"),
         (["serve", "{table}", "--cors-origin", "https://a.example/x"], r"is not an origin; give scheme, host and port"),
         (["serve", "{table}", "--workers", "0"], r"workers is 0; give at least 1"),
+        (
+            ["plan", "{table}", "-o", "{tmp}/m.png", "--height", "1", "--azimuth-stdev-deg", "-1"],
+            r"--azimuth-stdev-deg: '-1'",
+        ),
+        (["build", "{site}", "-o", "{tmp}/t.txt"], r"t\.txt is not a valid name of a table; end it in \.h5"),
+        (
+            ["calibrate", "{table}", "{site}", "-o", "{site}"],
+            r"was not written by rayfix calibrate; give the name of a",
+        ),
         (["frobnicate"], r"invalid choice: 'frobnicate'"),
         ([], r"required: COMMAND"),
         (["build", "{site}"], r"required: -o/--output"),
@@ -278,6 +314,10 @@ def test_mistakes_are_one_line_and_status_2(
         (
             '{"measurements": [{"type": "pt", "station_id": "bs9", "range_m": 5, "stdev_m": 1}]}',
             r"report\.json: .*'bs9'.*bs1",
+        ),
+        (
+            2 * '{"measurements": [{"type": "pt", "station_id": "bs1", "range_m": 5, "stdev_m": 1}]}\n',
+            r"report\.json holds more than one report; add -o FIXES\.jsonl",
         ),
     ],
 )

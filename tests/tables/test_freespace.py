@@ -1,6 +1,7 @@
 """The voxel map of the free space."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -47,3 +48,22 @@ def test_shapes_of_points() -> None:
     space = FreeSpace(origin=np.zeros(3), voxel_size=1.0, free=np.ones((1, 1, 1), bool))
     assert space.contains(np.full((4, 5, 3), 0.5)).shape == (4, 5)
     assert space.contains(np.zeros((0, 3))).shape == (0,)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_the_largest_deviation_is_that_of_points_drawn_anywhere(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    free = rng.random(rng.integers(1, 7, 3)) < 0.5
+    free[0, 0, 0] = True
+    space = FreeSpace(origin=rng.uniform(-50, 50, 3), voxel_size=rng.uniform(0.01, 2.0), free=free)
+    # Two Gauss-Legendre points along each side of a voxel have its first and second moments.
+    node = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T / np.sqrt(3.0)
+    points = (np.argwhere(free)[:, None] + node).reshape(-1, 3) * space.voxel_size
+    cov = np.atleast_2d(np.cov(points.T, bias=True))
+    assert space.largest_stdev == pytest.approx(np.sqrt(np.linalg.eigvalsh(cov)[-1]), rel=1e-9)
+
+
+def test_the_largest_deviation_of_a_long_hall() -> None:
+    space = FreeSpace(origin=np.zeros(3), voxel_size=0.5, free=np.ones((40, 10, 6), bool))
+    assert space.largest_stdev == pytest.approx(20.0 / np.sqrt(12.0), rel=1e-12)

@@ -101,6 +101,8 @@ def test_a_truncated_table(small_table_path: Path) -> None:
     for length in (8, 50, 96, 100, 800, 2048, 5000, len(raw) // 2, len(raw) - 100, len(raw) - 1):
         small_table_path.write_bytes(raw[:length])
         refused(small_table_path, CorruptTableError, REBUILD)
+    small_table_path.write_bytes(raw[: len(raw) // 2])
+    refused(small_table_path, CorruptTableError, "is cut short; ")
     small_table_path.write_bytes(raw)
     verified(small_table_path)
 

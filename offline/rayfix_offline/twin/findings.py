@@ -19,6 +19,9 @@ from rayfix_offline.twin.solids import Part, touched
 LARGE_SCENE, SMALL_SCENE = 1000.0, 1.0
 """A scene larger or smaller than this probably has another unit, m."""
 
+HIGH_ROOM = 60.0
+"""So has an empty room that is higher, m."""
+
 OPAQUE_ABOVE = 10.0
 """Carrier frequency above which thin partitions attenuate signals strongly, GHz."""
 
@@ -69,7 +72,10 @@ def size_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
     """Check the scene's unit and upward axis."""
     extent = scene.bounds[1] - scene.bounds[0]
     size = " x ".join(f"{length:,.6g}" for length in extent)
-    if extent.max() > LARGE_SCENE:
+    if site.room is not None:
+        if extent.max() > LARGE_SCENE or extent[2] > HIGH_ROOM:
+            yield warning("unit", f"the room is {size} m large", "size_m is in metres")
+    elif extent.max() > LARGE_SCENE:
         remedy = 'if its coordinates are millimetres, set scene_unit = "mm"'
         yield warning("unit", f"the scene is {size} m large", remedy)
     elif extent.max() < SMALL_SCENE:
@@ -80,6 +86,26 @@ def size_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
             "upward axis",
             f"the scene is {size} m large and seems to lie on its side",
             f'if {other} points up, set scene_up = "{other}"',
+        )
+
+
+def reach_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
+    """Find stations of an empty room whose rays end before they have crossed it."""
+    if site.room is None:
+        return
+    longest = site.propagation.max_path_length_m
+    far = []
+    for station in site.stations:
+        position = np.asarray(station.position_m)
+        across = float(np.linalg.norm(np.maximum(position - scene.bounds[0], scene.bounds[1] - position)))
+        if across > longest:
+            far.append((across, station.id))
+    if far:
+        names = _listed([f"'{name}'" for _, name in far])
+        yield warning(
+            "short paths",
+            f"rays end after max_path_length_m = {longest:g} m, before they reach all of the room from {names}",
+            f"give {max(far)[0]:.1f} at least, and more for reflected paths",
         )
 
 
@@ -136,6 +162,14 @@ def mesh_findings(
 def material_findings(site: SiteFile, scene: Scene) -> Iterator[Finding]:
     """Find where the constant loss replaces that of a material."""
     if site.propagation.reflection != "itu":
+        sides = () if site.room is None else (site.room.walls, site.room.floor, site.room.ceiling)
+        named = [f"'{name}'" for name in dict.fromkeys(sides) if name is not None and section_of(site, name) is None]
+        if named:
+            yield warning(
+                "material",
+                f'with reflection = "constant" the materials of the room are not looked up: {_listed(named)}',
+                'set reflection = "itu" in [propagation], or leave them out',
+            )
         return
     bare = np.count_nonzero(scene.face_materials < 0)
     if bare:

@@ -20,6 +20,7 @@ from rayfix_offline.twin.findings import (
     material_findings,
     mesh_findings,
     partition_findings,
+    reach_findings,
     size_findings,
     station_findings,
     wall_findings,
@@ -117,6 +118,7 @@ def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = 
         closed, free_space = sealed is not None, sealed or free_space
     findings = [
         *size_findings(site, scene),
+        *reach_findings(site, scene),
         *file_findings(scene),
         *mesh_findings(scene, duplicates, [part.moved(origin) for part in parts], enclosures),
         *material_findings(site, scene),

@@ -55,6 +55,8 @@ class FusionSettings:
         that.
     insufficient_above : float, m
         A best candidate whose largest standard deviation is above this makes the fix ``insufficient``.
+    insufficient_share : float
+        So does one that is wider than this share of the same deviation of a position anywhere in the free space.
     inconsistent_stretch : float
         By how many times the regions of an inconsistent fix are larger than its posterior says.
     most_turn_fixes : int
@@ -84,6 +86,7 @@ class FusionSettings:
     ambiguous_below: Probability = 0.7
     most_rivals: Annotated[int, Limits(least=1)] = 3
     insufficient_above: Annotated[float, Limits(above=0.0)] = 3.0
+    insufficient_share: Annotated[float, Limits(above=0.0)] = 0.7
     inconsistent_stretch: Annotated[float, Limits(least=1.0)] = 1.5
     most_turn_fixes: Annotated[int, Limits(least=0, most=1000)] = 16
 

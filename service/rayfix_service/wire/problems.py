@@ -138,7 +138,8 @@ def problem_of(root: type[WireModel], error: ErrorDetails, what: str) -> FieldPr
         found = f"is {shown(value['type'])}" if "type" in value else "is missing"
         text = f"{found}; give one of {', '.join(_tags(field))}"
     else:
-        found = "is missing" if kind == "missing" else f"is {shown(value)}"
+        is_quoted = kind in ("float_type", "int_type") and isinstance(value, str)
+        found = "is missing" if kind == "missing" else f"is {'the text ' if is_quoted else ''}{shown(value)}"
         text = f"{found}; give {_wanted(root, path, field)}"
     return FieldProblem(path=path, message=f"{path_text(path) or what} {text}")
 

@@ -8,7 +8,7 @@ from pydantic import BaseModel, Field
 from rayfix_service.wire.points import Point
 from rayfix_tables.geometry.mounting import boresight_of
 from rayfix_tables.level import Level
-from rayfix_tables.site import Mounting, Station
+from rayfix_tables.site import NO_BIAS, Deviations, Mounting, Station
 from rayfix_tables.table import Table
 
 
@@ -58,6 +58,29 @@ class BoresightSummary(BaseModel):
     downtilt_deg: float = Field(description="below the horizon")
 
 
+class AngleBiasSummary(BaseModel):
+    """Biases of angles that depend on the direction, linear between the directions of a grid."""
+
+    azimuths_deg: list[float] = Field(
+        description="of the grid, ascending; true directions, in the frame of the reports"
+    )
+    zeniths_deg: list[float]
+    azimuth_deg: list[list[float]] = Field(description="measured minus true, a row for each zenith")
+    zenith_deg: list[list[float]]
+
+
+class CalibrationSummary(BaseModel):
+    """What a calibration has found of a station; fixes take it into account."""
+
+    range_m: float = Field(description="bias of ranges, measured minus true")
+    azimuth_deg: float = Field(description="bias of azimuths, in the frame of the reports")
+    zenith_deg: float = Field(description="bias of zenith angles")
+    angles: AngleBiasSummary | None = Field(description="biases that depend on the direction, on top")
+    azimuth_stdev_deg: float | None = Field(description="standard deviation that counts instead of the stated one")
+    zenith_stdev_deg: float | None
+    range_stdev_m: float | None
+
+
 class StationSummary(BaseModel):
     """A station and its part of the table."""
 
@@ -70,6 +93,7 @@ class StationSummary(BaseModel):
         description="full opening angle of the cone around the boresight that it measures in"
     )
     levels: list[LevelSummary] = Field(description="finest first")
+    calibration: CalibrationSummary | None = Field(description="null where the site file states none")
 
 
 def table_summary(name: str, table: Table) -> TableSummary:
@@ -111,6 +135,30 @@ def station_summary(station: Station, levels: tuple[Level, ...]) -> StationSumma
             )
             for level in levels
         ],
+        calibration=_calibration(station),
+    )
+
+
+def _calibration(station: Station) -> CalibrationSummary | None:
+    bias, found = station.bias, station.deviations or Deviations()
+    if bias == NO_BIAS and found == Deviations():
+        return None
+    angles = None
+    if bias.angles is not None:
+        angles = AngleBiasSummary(
+            azimuths_deg=[_degrees(v) for v in bias.angles.azimuths],
+            zeniths_deg=[_degrees(v) for v in bias.angles.zeniths],
+            azimuth_deg=[[_degrees(v) for v in row] for row in bias.angles.azimuth],
+            zenith_deg=[[_degrees(v) for v in row] for row in bias.angles.zenith],
+        )
+    return CalibrationSummary(
+        range_m=bias.range,
+        azimuth_deg=_degrees(bias.azimuth),
+        zenith_deg=_degrees(bias.zenith),
+        angles=angles,
+        azimuth_stdev_deg=None if found.azimuth is None else _degrees(found.azimuth),
+        zenith_stdev_deg=None if found.zenith is None else _degrees(found.zenith),
+        range_stdev_m=found.range,
     )
 
 

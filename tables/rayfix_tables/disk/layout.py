@@ -150,6 +150,8 @@ def damage_reported(path: Path) -> Iterator[None]:
 
 
 def _damage(path: Path, error: Exception) -> CorruptTableError:
+    if "truncated file" in str(error):  # HDF5's words go on with addresses
+        return CorruptTableError(f"{path} is cut short; restore it from a copy or build it again")
     return CorruptTableError(f"{path} is damaged: {_one_line(error)}; restore it from a copy or build it again")
 
 

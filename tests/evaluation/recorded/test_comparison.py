@@ -195,7 +195,7 @@ def test_the_command(flat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     files = [str(flat / "opaque.h5"), str(flat / "passed.h5"), str(written(tmp_path, reports("behind", 24)))]
     assert main(["compare", *files, "--no-progress", "--jobs", "1"]) == 0
     out = capsys.readouterr().out
-    assert f"{flat / 'passed.h5'} is right: it explains a report better than {flat / 'opaque.h5'} by" in out
+    assert f"{flat / 'passed.h5'} is ahead: it explains a report better than {flat / 'opaque.h5'} by" in out
     assert "1 entry is no report" in out
     assert main(["compare", *files, "--no-progress", "--jobs", "1", "--json", "--reports", "12"]) == 0
     document = json.loads(capsys.readouterr().out)

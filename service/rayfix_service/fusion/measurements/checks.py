@@ -138,7 +138,8 @@ def _check(part: object, path: tuple[str | int, ...]) -> None:
         except (TypeError, ValueError):
             within = False
         if not within:
-            _refuse((*path, name), value, f"a finite number {limits}".rstrip())
+            unit = ", in radians" if name.startswith(("azimuth", "zenith")) else ""
+            _refuse((*path, name), value, f"a finite number {limits}".rstrip() + unit)
 
 
 def _refuse(path: tuple[str | int, ...], value: object, wanted: str) -> None:

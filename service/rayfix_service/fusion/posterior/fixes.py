@@ -88,7 +88,7 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
                 if p > _LEAST_CANDIDATE or n == 0
             )
             outlier = dict(zip(found.places, summary.outlier.tolist(), strict=True))
-            status = _status(candidates, summary.half_bad, settings)
+            status = _status(candidates, summary.half_bad, table.scene.free_space.largest_stdev, settings)
             best = candidates[0]
             regions = CredibleRegions(
                 position=best.position,
@@ -120,14 +120,23 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
     ).moved(table.scene.origin)
 
 
-def _status(candidates: tuple[Candidate, ...], half_bad: float, settings: FusionSettings) -> Status:
-    """Status of a fix, given the probability that at least half of the factors are outliers."""
+def _status(candidates: tuple[Candidate, ...], half_bad: float, anywhere: float, settings: FusionSettings) -> Status:
+    """Status of a fix.
+
+    Parameters
+    ----------
+    half_bad : float
+        Probability that at least half of the factors are outliers.
+    anywhere : float, m
+        Largest standard deviation of a position of which nothing is known.
+    """
     if half_bad > 0.5:
         return "inconsistent"
     if candidates[0].probability < settings.ambiguous_below:
         rivals = sum(candidate.probability for candidate in candidates[: settings.most_rivals])
         return "ambiguous" if rivals >= settings.ambiguous_below else "insufficient"
     # The sum of all variances is at least the largest, and three times it at most.
-    most, cov = settings.insufficient_above**2, candidates[0].covariance
+    most = min(settings.insufficient_above, settings.insufficient_share * anywhere) ** 2
+    cov = candidates[0].covariance
     narrow = float(cov.trace()) <= most or float(np.linalg.eigvalsh(cov)[-1]) <= most
     return "ok" if narrow else "insufficient"

@@ -9,7 +9,7 @@ from rayfix_service.fusion.measurements.report import Measurement
 from rayfix_service.locator import Locator
 from rayfix_tables.geometry.angles import angles_of
 from tests.support.messages.hand_reports import angle_of, report_of
-from tests.support.tables.hand_tables import POSITIONS, SIDE, UE, MakeTable, line_of_sight
+from tests.support.tables.hand_tables import ORIGIN, POSITIONS, SIDE, UE, MakeTable, line_of_sight
 
 
 def test_two_symmetric_rooms_are_ambiguous(make_table: MakeTable) -> None:
@@ -39,6 +39,18 @@ def test_two_stations_that_contradict_each_other_are_inconsistent(make_table: Ma
 def test_a_long_tube_alone_is_insufficient(make_table: MakeTable) -> None:
     tube = line_of_sight("a", length_stdev=5.0, log_mass=12.0)
     assert Locator(make_table(tube)).locate(report_of([angle_of(tube)])).status == "insufficient"
+
+
+def test_what_is_as_wide_as_the_room_is_insufficient(make_table: MakeTable) -> None:
+    """In a closet the 3 m that are wide in a hall say nothing: one angle told no more than that the UE is there."""
+    tube = line_of_sight("a", length_stdev=2.0, width=0.5, log_mass=12.0)
+    in_hall = Locator(make_table(tube)).locate(report_of([angle_of(tube)]))
+    assert in_hall.status == "ok"
+    free = np.zeros((SIDE,) * 3, np.bool_)
+    x, y, z = np.floor(UE - ORIGIN).astype(int)  # voxels of 1 m
+    free[x - 1 : x + 2, y - 1 : y + 2, z - 1 : z + 2] = True
+    in_closet = Locator(make_table(tube, free=free)).locate(report_of([angle_of(tube)]))
+    assert in_closet.status == "insufficient"
 
 
 def test_a_candidate_moves_out_of_a_solid(make_table: MakeTable) -> None:

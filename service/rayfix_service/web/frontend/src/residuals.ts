@@ -1,5 +1,6 @@
 /** From a report and its fix: the paths that explain it, and what is left over of each measurement. */
 
+import { calibrated } from "./calibrated";
 import { DEG, add, anglesOf, direction, localToScene, multiply, sub, transpose, vec, wrap } from "./numeric";
 import { signed, withDeviation } from "./rounding";
 import { explain, type Explanation, type Heard } from "./trace/explain";
@@ -15,7 +16,7 @@ export interface Residual {
   reason: string;
   /** What was measured, a line for each number. */
   text: readonly string[];
-  /** Measured minus explained, a line for each number, in the measurement's frame; empty where nothing explains it. */
+  /** Measured minus explained and the station's biases, a line for each number; empty where nothing explains it. */
   difference: readonly string[];
   /** The largest of the differences in standard deviations; null where there is none. */
   sigmas: number | null;
@@ -29,13 +30,18 @@ export interface ExplainedFix {
   residuals: Residual[];
 }
 
+type Differences = Pick<Residual, "difference" | "sigmas">;
+
+const UNEXPLAINED: Differences = { difference: [], sigmas: null };
+
 interface LengthForm {
   value: number;
   stdev: number;
 }
 
-export function explainFix(mirrors: Mirrors, site: Site, report: Report, fix: Fix, at: Vec3 | null): ExplainedFix {
+export function explainFix(mirrors: Mirrors, site: Site, reported: Report, fix: Fix, at: Vec3 | null): ExplainedFix {
   const stations = new Map(site.stations.map((s) => [s.id, s]));
+  const report = { ...reported, measurements: reported.measurements.map((m) => calibrated(m, stations)) };
   const north = site.table.site.north_deg * DEG;
   const paths = new Map<string, Explanation>();
   const several = new Map<number, Explanation>();
@@ -63,7 +69,8 @@ export function explainFix(mirrors: Mirrors, site: Site, report: Report, fix: Fi
     }
   }
   const offset = clockOffset(report, paths);
-  const residuals = report.measurements.map((measurement, n) => {
+  const residuals = reported.measurements.map((measurement, n) => {
+    const corrected = report.measurements[n]!;
     const outcome = fix.measurements.find((o) => o.index === n);
     const station = stations.get(measurement.station_id);
     return {
@@ -71,9 +78,10 @@ export function explainFix(mirrors: Mirrors, site: Site, report: Report, fix: Fi
       used: outcome?.used ?? false,
       reason: outcome?.reason ?? "",
       outlierProbability: outcome?.outlier_probability ?? null,
+      text: textOf(measurement, corrected),
       ...(measurement.type === "path"
-        ? pathDifference(measurement, station, north, several.get(n), offsets.get(clockOf(measurement) ?? "") ?? 0)
-        : difference(measurement, station, north, paths, offset)),
+        ? pathDifference(corrected, station, north, several.get(n), offsets.get(clockOf(measurement) ?? "") ?? 0)
+        : difference(corrected, station, north, paths, offset)),
       path: several.get(n) ?? paths.get(measurement.station_id),
     };
   });
@@ -207,24 +215,32 @@ function clockOffset(report: Report, paths: Map<string, Explanation>): number {
   return apart.length ? apart[apart.length >> 1]! : 0;
 }
 
+/** What was measured, with the deviation that counts. */
+function textOf(m: Measurement, corrected: Measurement): string[] {
+  const text = [];
+  if (m.azimuth_deg !== undefined) text.push(`azimuth ${withDeviation(m.azimuth_deg, corrected.azimuth_stdev_deg ?? 1, "°")}`);
+  if (m.zenith_deg != null) text.push(`zenith ${withDeviation(m.zenith_deg, corrected.zenith_stdev_deg ?? 1, "°")}`);
+  const measured = lengthOf(m);
+  if (measured !== null) text.push(withDeviation(measured.value, lengthOf(corrected)!.stdev, " m"));
+  return text.length ? text : [m.type];
+}
+
 function difference(
   m: Measurement,
   station: StationInfo | undefined,
   north: number,
   paths: Map<string, Explanation>,
   offset: number,
-): Pick<Residual, "text" | "difference" | "sigmas"> {
+): Differences {
   const path = paths.get(m.station_id);
   if (m.type === "aoa") return angleDifference(m, station, north, path);
   const measured = lengthOf(m);
-  if (measured === null) return { text: [m.type], difference: [], sigmas: null };
-  const { value, stdev } = measured;
-  const text = [withDeviation(value, stdev, " m")];
   const reference = m.reference_station_id === undefined ? undefined : paths.get(m.reference_station_id);
-  if (!path || (m.type === "tdoa" && !reference)) return { text, difference: [], sigmas: null };
+  if (measured === null || !path || (m.type === "tdoa" && !reference)) return UNEXPLAINED;
+  const { value, stdev } = measured;
   const expected = m.type === "tdoa" ? path.length - reference!.length : path.length + (m.type === "toa" ? offset : 0);
   const left = value - expected;
-  return { text, difference: [signed(left, stdev, " m")], sigmas: Math.abs(left) / stdev };
+  return { difference: [signed(left, stdev, " m")], sigmas: Math.abs(left) / stdev };
 }
 
 function pathDifference(
@@ -233,21 +249,17 @@ function pathDifference(
   north: number,
   path: Explanation | undefined,
   offset: number,
-): Pick<Residual, "text" | "difference" | "sigmas"> {
-  const angle = m.azimuth_deg === undefined ? null : angleDifference(m, station, north, path);
+): Differences {
+  const angle = m.azimuth_deg === undefined ? UNEXPLAINED : angleDifference(m, station, north, path);
   const measured = lengthOf(m);
-  const text = [...(angle?.text ?? [])];
-  const difference = [...(angle?.difference ?? [])];
-  const sigmas = angle?.sigmas == null ? [] : [angle.sigmas];
-  if (measured !== null) {
-    text.push(withDeviation(measured.value, measured.stdev, " m"));
-    if (path) {
-      const left = measured.value - offset - path.length;
-      difference.push(signed(left, measured.stdev, " m"));
-      sigmas.push(Math.abs(left) / measured.stdev);
-    }
+  const difference = [...angle.difference];
+  const sigmas = angle.sigmas === null ? [] : [angle.sigmas];
+  if (measured !== null && path) {
+    const left = measured.value - offset - path.length;
+    difference.push(signed(left, measured.stdev, " m"));
+    sigmas.push(Math.abs(left) / measured.stdev);
   }
-  return { text, difference, sigmas: sigmas.length ? Math.max(...sigmas) : null };
+  return { difference, sigmas: sigmas.length ? Math.max(...sigmas) : null };
 }
 
 function angleDifference(
@@ -255,16 +267,14 @@ function angleDifference(
   station: StationInfo | undefined,
   north: number,
   path: Explanation | undefined,
-): Pick<Residual, "text" | "difference" | "sigmas"> {
+): Differences {
+  if (!path || !station) return UNEXPLAINED;
   const stdevs = { azimuth: m.azimuth_stdev_deg ?? 1, zenith: m.zenith_stdev_deg ?? 1 };
-  const text = [`azimuth ${withDeviation(m.azimuth_deg!, stdevs.azimuth, "°")}`];
-  if (m.zenith_deg != null) text.push(`zenith ${withDeviation(m.zenith_deg, stdevs.zenith, "°")}`);
-  if (!path || !station) return { text, difference: [], sigmas: null };
   const expected = measuredAngles(m, station, north, path);
   const turn = wrap(m.azimuth_deg! * DEG - expected.azimuth) / DEG;
   const tilt = m.zenith_deg == null ? null : m.zenith_deg - expected.zenith / DEG;
   const difference = [signed(turn, stdevs.azimuth, "°")];
   if (tilt !== null) difference.push(signed(tilt, stdevs.zenith, "°"));
   const sigmas = Math.max(Math.abs(turn) / stdevs.azimuth, Math.abs(tilt ?? 0) / stdevs.zenith);
-  return { text, difference, sigmas };
+  return { difference, sigmas };
 }

@@ -26,6 +26,20 @@ export interface StationInfo {
   boresight: { azimuth_deg: number; downtilt_deg: number };
   field_of_view_deg: number;
   levels: { window_deg: number; num_cells: number; num_components: number }[];
+  /** Absent in pages of earlier versions. */
+  calibration?: Calibration | null;
+}
+
+/** Biases, measured minus true, and deviations that count instead of the stated ones. */
+export interface Calibration {
+  range_m: number;
+  azimuth_deg: number;
+  zenith_deg: number;
+  /** What depends on the direction: a row for each zenith of the grid. */
+  angles: { azimuths_deg: number[]; zeniths_deg: number[]; azimuth_deg: number[][]; zenith_deg: number[][] } | null;
+  azimuth_stdev_deg: number | null;
+  zenith_stdev_deg: number | null;
+  range_stdev_m: number | null;
 }
 
 export interface ViewerSettings {

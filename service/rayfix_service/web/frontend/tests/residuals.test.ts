@@ -1,9 +1,10 @@
 import { describe, expect, test } from "vitest";
 
+import { calibrated } from "../src/calibrated";
 import { DEG, add, wrap } from "../src/numeric";
 import { explainFix, measuredAngles, sceneAngles } from "../src/residuals";
 import { Mirrors } from "../src/trace/mirrors";
-import type { Fix, Measurement, Report, Site, StationInfo, Vec3 } from "../src/types";
+import type { Calibration, Fix, Measurement, Report, Site, StationInfo, Vec3 } from "../src/types";
 import { between, boxes, random } from "./rooms";
 
 const STATION: Vec3 = [1, 1.5, 2];
@@ -19,6 +20,58 @@ function station(at: Vec3): StationInfo {
     levels: [],
   };
 }
+
+const CALIBRATION: Calibration = {
+  range_m: 0.4,
+  azimuth_deg: 2,
+  zenith_deg: -1,
+  angles: {
+    azimuths_deg: [-180, 0, 180],
+    zeniths_deg: [60, 120],
+    azimuth_deg: [[0, 3, 0], [0, 6, 0]],
+    zenith_deg: [[0, 0, 0], [0, 0, 0]],
+  },
+  azimuth_stdev_deg: 3,
+  zenith_stdev_deg: null,
+  range_stdev_m: 0.2,
+};
+
+describe("a calibrated measurement", () => {
+  const stations = new Map([["bs1", { ...station(STATION), calibration: CALIBRATION }]]);
+
+  test("is without the biases, those that depend on the direction among them", () => {
+    // At azimuth 60 and zenith 90 deg the grid has 4.5 * (1 - 60 / 180) = 3 deg.
+    const m: Measurement = {
+      type: "aoa",
+      station_id: "bs1",
+      azimuth_deg: 60 + 3 + 2,
+      azimuth_stdev_deg: 1,
+      zenith_deg: 90 - 1,
+      zenith_stdev_deg: 1,
+    };
+    const found = calibrated(m, stations);
+    expect(found.azimuth_deg).toBeCloseTo(60, 4);
+    expect(found.zenith_deg).toBeCloseTo(90, 9);
+    expect([found.azimuth_stdev_deg, found.zenith_stdev_deg]).toEqual([3, 1]);
+  });
+
+  test.each([
+    [{ type: "pt", range_m: 7, stdev_m: 1 }, { range_m: 6.6, stdev_m: 0.2 }],
+    [{ type: "toa", toa_m: 7, stdev_m: 1 }, { toa_m: 6.6, stdev_m: 0.2 }],
+    [{ type: "pt", round_trip_ns: 100, reply_ns: 50, stdev_ns: 1 }, { round_trip_ns: 100 - 0.8 / 0.299792458, stdev_ns: 0.4 / 0.299792458 }],
+    [{ type: "tdoa", reference_station_id: "bs2", range_difference_m: 1, stdev_m: 1 }, { range_difference_m: 0.6, stdev_m: 1 }],
+    [{ type: "path", delay_ns: 10, stdev_ns: 1 }, { delay_ns: 10 }],
+    [{ type: "rssi", rssi_dbm: -60 }, { rssi_dbm: -60 }],
+  ])("has the length that is true: %j", (m, expected) => {
+    const found = calibrated({ ...m, station_id: "bs1" }, stations);
+    for (const [key, value] of Object.entries(expected)) expect(found[key]).toBeCloseTo(value, 9);
+  });
+
+  test("is as it was where its station is not calibrated", () => {
+    const m: Measurement = { type: "pt", station_id: "bs1", range_m: 7, stdev_m: 1 };
+    expect(calibrated(m, new Map([["bs1", station(STATION)]]))).toBe(m);
+  });
+});
 
 describe("angles in the frame of a measurement", () => {
   test("are those that the scene's were made of, in every frame", () => {
@@ -51,7 +104,7 @@ describe("angles in the frame of a measurement", () => {
 
 describe("a fix explained", () => {
   /** A room whose mesh and positions are all moved by `origin`; the report tells of the reflection at the wall y = 4. */
-  function explained(origin: Vec3): ReturnType<typeof explainFix> {
+  function explained(origin: Vec3, calibration: Calibration | null = null): ReturnType<typeof explainFix> {
     const mesh = { ...boxes([[0, 0, 0], [5, 4, 3]]), origin };
     const straight = [3, 5, -1] as const;
     const measurements: Measurement[] = [
@@ -69,7 +122,7 @@ describe("a fix explained", () => {
     const fix = { measurements: measurements.map((_, index) => ({ index, used: true, outlier_probability: 0 })) } as unknown as Fix;
     const site: Site = {
       table: { name: "", table_id: "", software_version: "", num_components: 0, site: { name: "", north_deg: 0, max_path_length_m: 30 } },
-      stations: [station(add(STATION, origin))],
+      stations: [{ ...station(add(STATION, origin)), calibration }],
       settings: { simulation: false, max_reflections: 2, open_materials: [] },
     };
     return explainFix(new Mirrors(mesh), site, report, fix, add(POSITION, origin));
@@ -86,6 +139,14 @@ describe("a fix explained", () => {
       [["5.67 ± 0.50 m"], ["−0.25 m"]],
     ]);
     expect(residuals[0]!.sigmas).toBeCloseTo(0.5, 2);
+  });
+
+  test("is less the station's biases", () => {
+    const found = { ...CALIBRATION, azimuth_deg: 0.5, zenith_deg: 0, angles: null };
+    expect(explained([0, 0, 0], found).residuals.map((r) => [r.text, r.difference])).toEqual([
+      [["azimuth 59.5 ± 3.0°", "zenith 99.7 ± 2.0°"], ["0.0°", "0.0°"]],
+      [["5.67 ± 0.20 m"], ["−0.65 m"]],
+    ]);
   });
 
   test.each(["range_m", "toa_m", "delay_ns"])("has a path for each of several that a station measured, by %s", (length) => {
