@@ -67,7 +67,7 @@ def _build(options: argparse.Namespace) -> int:
     from rayfix.console import print_build_summary
     from rayfix.progress import build_progress
 
-    if options.output.suffix.lower() not in _TABLES:
+    if options.output.suffix.lower() not in _TABLES and not options.output.exists():
         raise BuildError(f"{options.output} is not a valid name of a table; end it in {_TABLES[0]}")
 
     with build_progress(enabled=not options.no_progress) as progress:
