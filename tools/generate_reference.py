@@ -118,6 +118,8 @@ def _toml(value: Any) -> str:
     match value:
         case None:
             return "not given"
+        case bool():
+            return f"`{str(value).lower()}`"
         case str():
             return f'`"{value}"`'
         case list():
@@ -139,7 +141,10 @@ def _limits(field: dict[str, Any]) -> str:
         inner = _limits(field["prefixItems"][0])
         return f"{len(field['prefixItems'])} numbers" + (f", each {inner}" if inner else "")
     if "items" in field:
-        return f"numbers, each {_limits(field['items'])}"
+        inner = _limits(field["items"])
+        return f"rows of {inner}" if "items" in field["items"] else f"numbers, each {inner}"
+    if field.get("type") == "boolean":
+        return "`true`, `false`"
     if "$ref" in field or "pattern" in field:
         return ""
     parts: list[str] = []
@@ -181,8 +186,10 @@ def _usage(command: argparse.ArgumentParser) -> str:
         if action.option_strings and action.required:
             words.append(f"{action.option_strings[0]} {_metavar(action)}")
         elif not action.option_strings:
-            words.append(_metavar(action))
-    return " ".join([command.prog, *words, "[options]"])
+            name = _metavar(action)
+            words.append({"?": f"[{name}]", "+": f"{name} [{name} ...]"}.get(str(action.nargs), name))
+    more = any(action.option_strings and not action.required for action in command._actions if action.dest != "help")
+    return " ".join([command.prog, *words, *["[options]"] * more])
 
 
 def _arguments(command: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
@@ -191,6 +198,8 @@ def _arguments(command: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
             continue
         value = f" {_metavar(action)}" if action.nargs != 0 else ""
         form = ", ".join(f"`{option}{value}`" for option in action.option_strings) or f"`{_metavar(action)}`"
+        if not action.option_strings and action.nargs == "?":
+            form += ", may be left out"
         text = (action.help or "").replace("%%", "%").replace("|", "\\|")
         if action.choices and action.metavar is None and action.option_strings:
             text = f"{text}: {', '.join(f'`{choice}`' for choice in action.choices)}"
@@ -202,7 +211,9 @@ def _metavar(action: argparse.Action) -> str:
         return " ".join(action.metavar)
     if action.metavar is not None:
         return str(action.metavar)
-    return "VALUE" if action.choices else action.dest.upper()
+    if action.choices:
+        return "VALUE" if action.option_strings else "|".join(str(choice) for choice in action.choices)
+    return action.dest.upper()
 
 
 PAGES = {"site-file.md": site_page, "command-line.md": command_page}
