@@ -47,13 +47,14 @@ between saves time:
 | times alone (UWB, RTOA) | none | `[5, 15]`: components of all directions are merged anyway |
 
 Cells are built at the finest window only; wider ones are sums of them. The number of the finest cells falls with its
-square. In the bundled hall, balancing included:
+square. In the bundled hall, balancing and maps of paths included:
 
 | `windows_deg` | processor time | table |
 |---|---|---|
 {measured}
 
-So the coarse windows cost about a sixth of the default's time and a ninth of its size. All deviations up to the finest window
+So the coarse windows cost about a quarter of the default's time and size. Of each size, 53 MB are the stations' maps of paths, which
+depend on no window ([of what a table's size is made](performance.md#the-whole-build)). All deviations up to the finest window
 divided by 1.25 are served by it; where they are far below it, edges of what a station sees are less sharp than they could be.
 """
 
@@ -82,10 +83,10 @@ the code: `make reference`.
 """
 
 WINDOWS_MEASURED = """\
-| `[1.25, 5, 15]` | 37 s on two idle cores ([performance](performance.md)), so 74 s at most | 294 MB |
-| `[2.5, 10]` | 26 s | 73 MB |
-| `[5, 15]` | 12 s | 28 MB |"""
-"""Measured by builds of `rayfix example` with these windows, one job and kernels that were compiled before."""
+| `[1.25, 5, 15]` | 86 s | 294 MB |
+| `[2.5, 10]` | 37 s | 126 MB |
+| `[5, 15]` | 22 s | 81 MB |"""
+"""By builds of `rayfix example` with these windows, one job and kernels that were compiled before, on busy cores."""
 
 
 def site_page() -> str:
