@@ -1,4 +1,4 @@
-"""``rayfix demo``: builds, serves and locates in the bundled hall, in a minute or two."""
+"""``rayfix demo``: builds, serves and locates in the bundled hall."""
 
 import json
 import signal

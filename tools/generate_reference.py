@@ -47,13 +47,14 @@ between saves time:
 | times alone (UWB, RTOA) | none | `[5, 15]`: components of all directions are merged anyway |
 
 Cells are built at the finest window only; wider ones are sums of them. The number of the finest cells falls with its
-square. In the bundled hall, balancing included:
+square. In the bundled hall, balancing and maps of paths included:
 
 | `windows_deg` | processor time | table |
 |---|---|---|
 {measured}
 
-So the coarse windows cost about a sixth of the default's time and a ninth of its size. All deviations up to the finest window
+So the coarse windows cost about a quarter of the default's time and size. Of each size, 53 MB are the stations' maps of paths, which
+depend on no window ([of what a table's size is made](performance.md#the-whole-build)). All deviations up to the finest window
 divided by 1.25 are served by it; where they are far below it, edges of what a station sees are less sharp than they could be.
 """
 
@@ -82,10 +83,10 @@ the code: `make reference`.
 """
 
 WINDOWS_MEASURED = """\
-| `[1.25, 5, 15]` | 37 s on two idle cores ([performance](performance.md)), so 74 s at most | 294 MB |
-| `[2.5, 10]` | 26 s | 73 MB |
-| `[5, 15]` | 12 s | 28 MB |"""
-"""Measured by builds of `rayfix example` with these windows, one job and kernels that were compiled before."""
+| `[1.25, 5, 15]` | 86 s | 294 MB |
+| `[2.5, 10]` | 37 s | 126 MB |
+| `[5, 15]` | 22 s | 81 MB |"""
+"""By builds of `rayfix example` with these windows, one job and kernels that were compiled before, on busy cores."""
 
 
 def site_page() -> str:
@@ -118,6 +119,8 @@ def _toml(value: Any) -> str:
     match value:
         case None:
             return "not given"
+        case bool():
+            return f"`{str(value).lower()}`"
         case str():
             return f'`"{value}"`'
         case list():
@@ -139,7 +142,10 @@ def _limits(field: dict[str, Any]) -> str:
         inner = _limits(field["prefixItems"][0])
         return f"{len(field['prefixItems'])} numbers" + (f", each {inner}" if inner else "")
     if "items" in field:
-        return f"numbers, each {_limits(field['items'])}"
+        inner = _limits(field["items"])
+        return f"rows of {inner}" if "items" in field["items"] else f"numbers, each {inner}"
+    if field.get("type") == "boolean":
+        return "`true`, `false`"
     if "$ref" in field or "pattern" in field:
         return ""
     parts: list[str] = []
@@ -181,8 +187,10 @@ def _usage(command: argparse.ArgumentParser) -> str:
         if action.option_strings and action.required:
             words.append(f"{action.option_strings[0]} {_metavar(action)}")
         elif not action.option_strings:
-            words.append(_metavar(action))
-    return " ".join([command.prog, *words, "[options]"])
+            name = _metavar(action)
+            words.append({"?": f"[{name}]", "+": f"{name} [{name} ...]"}.get(str(action.nargs), name))
+    more = any(action.option_strings and not action.required for action in command._actions if action.dest != "help")
+    return " ".join([command.prog, *words, *["[options]"] * more])
 
 
 def _arguments(command: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
@@ -191,6 +199,8 @@ def _arguments(command: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
             continue
         value = f" {_metavar(action)}" if action.nargs != 0 else ""
         form = ", ".join(f"`{option}{value}`" for option in action.option_strings) or f"`{_metavar(action)}`"
+        if not action.option_strings and action.nargs == "?":
+            form += ", may be left out"
         text = (action.help or "").replace("%%", "%").replace("|", "\\|")
         if action.choices and action.metavar is None and action.option_strings:
             text = f"{text}: {', '.join(f'`{choice}`' for choice in action.choices)}"
@@ -202,7 +212,9 @@ def _metavar(action: argparse.Action) -> str:
         return " ".join(action.metavar)
     if action.metavar is not None:
         return str(action.metavar)
-    return "VALUE" if action.choices else action.dest.upper()
+    if action.choices:
+        return "VALUE" if action.option_strings else "|".join(str(choice) for choice in action.choices)
+    return action.dest.upper()
 
 
 PAGES = {"site-file.md": site_page, "command-line.md": command_page}
