@@ -16,7 +16,7 @@ from rayfix_service.fusion.measurements.directions import (
     without_bias,
 )
 from rayfix_service.fusion.measurements.report import MeasuredPath
-from rayfix_service.fusion.quadrature.blocks import StationPaths
+from rayfix_service.fusion.quadrature.detection import DetectedPaths
 from rayfix_service.fusion.quadrature.observed import measured_direction
 from rayfix_service.fusion.quadrature.path_sets import (
     CLOCK,
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 class StationSet(NamedTuple):
     """Measured paths of a station, and the paths that they may be of, with their probabilities to be reported."""
 
-    paths: StationPaths
+    paths: DetectedPaths
     measured: MeasuredSet
 
 
@@ -70,6 +70,7 @@ class PathSets:
         blocks: NDArray[np.int64],
         spread: float,
         resolution: float,
+        together: float,
         level: int,
         log_likelihood: Array,
         information: Array,
@@ -78,6 +79,8 @@ class PathSets:
 
         Parameters
         ----------
+        together : float
+            Measurements that tell of the same direction.
         level : int
             Size of the blocks, 0 for the smallest.
         """
@@ -85,14 +88,17 @@ class PathSets:
         beams, first = tuple(new_beams(len(points))), 0
         for group in self.groups:
             bits: list[int] = []
-            for paths, measured in group:
+            for detected, measured in group:
+                paths = detected.paths
                 geometry = paths.images, paths.mirrors
                 extend_beams(
                     points,
                     blocks,
                     spread,
                     resolution,
+                    together,
                     tuple(paths.levels[level]),
+                    tuple(detected.detail(level)),
                     geometry,
                     tuple(measured),
                     beams,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.quadrature.blocks import BlockPaths, BlockTree
 from rayfix_service.fusion.quadrature.reweighted import Reweighted
-from rayfix_service.fusion.quadrature.selection import detected_paths, heaviest_first, none_before, selected_paths
+from rayfix_service.fusion.quadrature.selection import heaviest_first, none_before, selected_paths
 from rayfix_service.fusion.quadrature.spread import spread_paths
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import FixStoppedError, Stop
@@ -74,15 +74,6 @@ def test_any_takes_audible_paths_alike() -> None:
     np.testing.assert_allclose(by_sequence(loud), [0.4, 0.4, 0.2], rtol=1e-3)
     np.testing.assert_allclose(by_sequence(faint)[1:], [2.0 / 3.0, 1.0 / 3.0], atol=1e-3)
     assert by_sequence(faint)[0] < 1e-3
-
-
-def test_a_path_at_the_limit_is_as_likely_as_not_to_be_reported() -> None:
-    paths = one_voxel([1.0, 1.0, 1.0], [0.0, 0.0, 0.0])
-    gain = 1.0 / LENGTHS**2
-    below = 10.0 * math.log10(gain.sum() / gain[0])
-    found = by_sequence(detected_paths(paths, below))
-    assert found[0] == pytest.approx(0.475, abs=0.015)  # half of the 95 % that no path exceeds
-    assert 0.9 < found[1] < 0.96
 
 
 def test_spreading_against_dictionaries() -> None:
