@@ -1,8 +1,8 @@
 """Times of arrival of single paths beside stations that report several.
 
-A time of arrival is a length of one path on the UE's clock, which those of measured paths with a time on that clock share.
-So it is a set of one measured path, whichever path of its station that is; with the angle of its station, if there is
-one, since they are of the same path.
+A time of arrival is a length of one path on the UE's clock, which measured paths with a time on that clock share. So it
+is a set of one measured path, whichever path of its station that is; with the angle of its station, if there is one,
+since they are of the same path.
 """
 
 from collections import defaultdict
@@ -64,8 +64,8 @@ def paths_and_times(report: Report) -> PathsAndTimes:
     for index, measurement in enumerate(report.measurements):
         if isinstance(measurement, TimeDifference):
             raise ReportError(
-                f"measurements[{index}] is a time difference (tdoa) beside measurements of type path; give the times of "
-                "arrival that it is of, as toa",
+                f"measurements[{index}] is a time difference (tdoa) beside measurements of type path; give the times "
+                "of arrival that it is of, as toa",
                 path=("measurements", index),
             )
         if not isinstance(measurement, MeasuredPath):
@@ -90,7 +90,7 @@ def paths_and_times(report: Report) -> PathsAndTimes:
     on_clock = [n for n, m in paths if m.clock == "ue" and m.length is not None]
     unused: dict[int, str] = {}
     if len(single) == 1 and not on_clock:
-        (index, angle), = single.items()
+        ((index, angle),) = single.items()
         unused[index] = ALONE
         if angle is not None:  # the angle tells of the position without the time
             measurements[angle] = report.measurements[angle]

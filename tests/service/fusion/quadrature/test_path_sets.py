@@ -228,9 +228,6 @@ def test_the_clock_is_common_to_all_stations(mirrored: Table) -> None:
 def test_what_cannot_be_together_is_refused(mirrored: Table) -> None:
     locator = Locator(mirrored)
     rows = seen("a", "toa_m")
-    toa = [{"type": "toa", "station_id": name, "range_m": 9.0, "stdev_m": 0.1} for name in ("a", "b")]
-    with pytest.raises(ReportError, match="give these times as paths with toa_m"):
-        locator.locate({"measurements": rows + toa})
     with pytest.raises(ReportError, match="on another clock"):
         locator.locate({"measurements": [rows[0], seen("a", "range_m")[1]]})
     many = [{**rows[0], "toa_m": 9.0 + 0.1 * n} for n in range(63)]
