@@ -160,11 +160,13 @@ def integrate(
         coarse = width**2 / 12.0 * found.information > limits.resolution
         if halvings >= limits.most_halvings:
             limited, coarse = limited or _matter(log_mass, coarse, batches, limits), np.zeros_like(coarse)
-        batches.append(_Batch(halvings, width, front, point, height, log_volume, log_mass, coarse, found))
+        batches.append(
+            _Batch(halvings, width, front, point, height, log_volume, log_mass, coarse, found, _log_sum(log_mass))
+        )
         num_leaves += len(front.block)
         # Halving a block changes what the posterior is thought to be, so that others may matter that did not before.
-        log_all = float(np.logaddexp.reduce([batch.log_sum() for batch in batches]))
-        which = [batch.coarse & (batch.log_mass - log_all > math.log(limits.least_share)) for batch in batches]
+        least = _log_sum(np.array([batch.log_total for batch in batches])) + math.log(limits.least_share)
+        which = [batch.coarse & (batch.log_mass > least) for batch in batches]
         waiting = [batch.halvings for batch, some in zip(batches, which, strict=True) if some.any()]
         if not waiting:
             break
@@ -184,12 +186,21 @@ def integrate(
 
 def _matter(log_mass: Array, coarse: NDArray[np.bool_], batches: Sequence["_Batch"], limits: GridLimits) -> bool:
     """Whether blocks that are not halved any more, though they are coarse, hold a share that matters."""
-    log_all = np.logaddexp.reduce([np.logaddexp.reduce(log_mass), *(batch.log_sum() for batch in batches)])
+    log_all = _log_sum(np.array([_log_sum(log_mass), *(batch.log_total for batch in batches)]))
     return bool(np.any(coarse & (log_mass - log_all > math.log(limits.least_share))))
 
 
+def _log_sum(log_mass: Array) -> float:
+    """Natural logarithm of a sum, whose terms are given by theirs."""
+    most = float(log_mass.max(initial=-math.inf))
+    return most + math.log(float(np.exp(log_mass - most).sum())) if most > -math.inf else most
+
+
 class _Batch(NamedTuple):
-    """Blocks of one size that were evaluated together; ``coarse`` are those that may be halved."""
+    """Blocks of one size that were evaluated together.
+
+    ``coarse`` are those that may be halved, ``log_total`` is the natural logarithm of what they hold together.
+    """
 
     halvings: int
     width: float
@@ -200,10 +211,7 @@ class _Batch(NamedTuple):
     log_mass: Array
     coarse: NDArray[np.bool_]
     found: "_Evaluated"
-
-    def log_sum(self) -> float:
-        """Natural logarithm of what they hold together."""
-        return float(np.logaddexp.reduce(self.log_mass, initial=-math.inf))
+    log_total: float
 
     def without(self, which: NDArray[np.bool_]) -> "_Batch":
         """Leave some blocks out."""
@@ -219,6 +227,7 @@ class _Batch(NamedTuple):
             self.log_mass[keep],
             self.coarse[keep],
             _Evaluated(found.log_likelihood[keep], found.information[keep], found.late[:, keep], found.lost[:, keep]),
+            _log_sum(self.log_mass[keep]),
         )
 
 
