@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rayfix_service.fusion.quadrature.detection import detected_at, detected_paths, log_odds, shares_at_corners
-from tests.service.fusion.quadrature.test_selection import LENGTHS, one_voxel
+from tests.support.tables.one_voxel import LENGTHS, one_voxel
 
 
 def test_shares_at_corners_against_dictionaries() -> None:

@@ -17,6 +17,7 @@ from rayfix_service.wire import InvalidReportError, parse_report, report_to_docu
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table
+from tests.support.tables.mirrored_paths import AT, seen
 from tests.support.tables.open_room import POSITIONS, mirrored_room_table
 
 
@@ -158,29 +159,6 @@ def test_hypotheses_that_are_left_out_hardly_matter() -> None:
     measured = noisy(np.random.default_rng(5), ["L"] * 3, "ue", 5.0)
     found, _ = evaluated(measured, 3.0)
     assert found == pytest.approx(log_density(measured, np.arange(-20.0, 30.0, 0.01), 3.0), abs=0.03)
-
-
-AT = np.array([3.0, 4.0, 1.2])
-
-
-def seen(name: str, clock: str, offset: float = 0.0, place: NDArray[np.float64] = AT) -> list[dict[str, object]]:
-    """Return the direct path from a station of the mirrored room, and the one by its wall, without noise."""
-    rows: list[dict[str, object]] = []
-    x, y, z = POSITIONS[name]
-    lengths = []
-    for image, turn in ((np.array([x, y, z]), 1.0), (np.array([12.0 - x, y, z]), -1.0)):
-        apart = place - image
-        length = float(np.linalg.norm(apart))
-        lengths.append(length)
-        a, b, c = apart * np.array([turn, 1.0, 1.0]) / length
-        row: dict[str, object] = {"type": "path", "station_id": name, "azimuth_stdev_deg": 1.0, "zenith_stdev_deg": 1.0}
-        row |= {"azimuth_deg": math.degrees(math.atan2(b, a)), "zenith_deg": math.degrees(math.acos(c))}
-        if clock == "delay_ns":
-            row |= {"delay_ns": (length - lengths[0]) / 0.299792458, "stdev_ns": 0.3}
-        else:
-            row |= {clock: length + offset, "stdev_m": 0.1}
-        rows.append(row)
-    return rows
 
 
 @pytest.mark.parametrize(("clock", "offset"), [("range_m", 0.0), ("toa_m", 1234.5), ("delay_ns", 0.0)])

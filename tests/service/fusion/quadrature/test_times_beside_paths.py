@@ -6,7 +6,7 @@ from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.locator import Locator
 from rayfix_tables.errors import ReportError
 from rayfix_tables.table import Table
-from tests.service.fusion.quadrature.test_path_sets import AT, seen
+from tests.support.tables.mirrored_paths import AT, seen
 from tests.support.tables.open_room import mirrored_room_table
 
 
