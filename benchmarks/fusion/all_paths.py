@@ -3,7 +3,8 @@
 Each row is of uniform places and of noise with the stated deviations. ``50`` and ``90`` are quantiles of the error, m;
 ``bound`` those of the position error bound of the same paths; ``full`` is the row of the places where each station has
 as many paths as it may report; ``held`` is how many true positions the 90 % regions hold, per cent; ``ms`` is the
-processor time of a fix, its median and 90 %.
+processor time of a fix, its median and 90 %. ``--stress`` prints curves over the number of paths that a station
+reports, of spurious and of missing ones, and one path of each station given as a path and as an angle and a range.
 """
 
 import time
@@ -55,6 +56,14 @@ ROWS = (
     Row(stations=4),
     Row(stations=4, spurious=2),
 )
+
+STRESS = (
+    *(Row(stations=stations, most=most) for stations in (1, 4) for most in range(1, 7)),
+    *(Row(stations=4, spurious=spurious) for spurious in (1, 2, 3)),
+    *(Row(stations=4, missing=missing) for missing in (0.2, 0.4, 0.6)),
+    *(Row(clock="known", spurious=spurious) for spurious in (1, 2, 3)),
+)
+"""Curves over the number of paths reported, spurious ones among five, and missing ones."""
 
 
 def deviations(degrees: float, metres: float) -> Noise:
@@ -139,9 +148,40 @@ def rules(locator: Locator, drops: list[Drop], seed: int) -> None:
         print(f"select {rule}, stated {stated}, {degrees:g} deg, {timing}: {found.line()}", flush=True)
 
 
-def run(table: Table, count: int, seed: int) -> None:
+def one_path(locator: Locator, drops: list[Drop], seed: int) -> None:
+    """Print the row of one path of each of four stations, given as a set of one, and as an angle and a range."""
+    noise = deviations(1.0, 0.3)
+    for title in ("as path", "as aoa and pt"):
+        rng, found = np.random.default_rng([seed, 3]), Errors()
+        for number, drop in enumerate(drops):
+            names = rng.permutation(list(drop.paths))[:4].tolist()
+            strongest = {name: drop.paths[name].only(0) for name in names}
+            # Both draw the same errors, or they could not be compared.
+            errors = np.random.default_rng([seed, 4, number])
+            report = simulate_paths(strongest, noise, rng=errors, most=1, clock="known")
+            if title != "as path":
+                report = {"measurements": [each for row in report["measurements"] for each in angle_and_range(row)]}
+            if number == 0:
+                locator.locate(report)
+            found.locate(locator, report, drop.position)
+        print(f"4 stations, one path each, known clock, {title}: {found.line()}", flush=True)
+
+
+def angle_and_range(path: dict[str, Any]) -> list[dict[str, Any]]:
+    """Give a measured path as an angle of arrival and a propagation time."""
+    angle = {key: value for key, value in path.items() if key not in ("range_m", "stdev_m")}
+    length = {key: path[key] for key in ("station_id", "range_m", "stdev_m")}
+    return [angle | {"type": "aoa"}, length | {"type": "pt"}]
+
+
+def run(table: Table, count: int, seed: int, *, stress: bool) -> None:
     locator = Locator(table)
     drops = [drop for drop in drop_uniformly(table, count, np.random.default_rng(seed)) if drop.paths]
+    if stress:
+        one_path(locator, drops, seed)
+        for row in STRESS:
+            several(locator, drops, row, seed)
+        return
     rules(locator, drops, seed)
     for row in ROWS:
         several(locator, drops, row, seed)
@@ -150,9 +190,10 @@ def run(table: Table, count: int, seed: int) -> None:
 def main() -> None:
     parser = table_parser(__doc__)
     parser.add_argument("--places", type=int, default=200)
+    parser.add_argument("--stress", action="store_true", help="curves over numbers of reported and spurious paths")
     options = parser.parse_args()
     with open_or_build(options.table) as table:
-        run(table, options.places, options.seed)
+        run(table, options.places, options.seed, stress=options.stress)
 
 
 if __name__ == "__main__":

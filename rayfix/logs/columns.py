@@ -17,14 +17,10 @@ from rayfix_tables.errors import ReportError
 
 _TEXTS = ("type", "station_id", "reference_station_id", "frame", "error_model")
 
-_ANGLES = (
-    "azimuth_deg",
-    "azimuth_stdev_deg",
-    "zenith_deg",
-    "zenith_stdev_deg",
-    "correlation",
-    "frame",
-)
+_DIRECTIONS = ("azimuth_deg", "azimuth_stdev_deg", "zenith_deg", "zenith_stdev_deg", "frame")
+_ANGLES = (*_DIRECTIONS, "correlation")
+_OF_PATH = ("toa_m", "power_db")
+"""What a row has only where it is one of several paths of a station."""
 _TIMES = ("range_m", "delay_ns", "toa_ns", "tod_ns", "round_trip_ns", "reply_ns")
 _DIFFERENCES = ("range_difference_m", "delay_difference_ns", "reference_station_id")
 _STRENGTHS = ("rssi_dbm", "power_at_1m_dbm", "path_loss_exponent", "shadowing_stdev_db")
@@ -38,6 +34,7 @@ _KEYS: dict[str, tuple[str, ...]] = {
     "toa": ("range_m", "delay_ns", *_SPREADS, *_ERRORS, *_SIGHT),
     "tdoa": (*_DIFFERENCES, *_SPREADS, *_ERRORS),
     "rssi": _STRENGTHS,
+    "path": (*_DIRECTIONS, "range_m", "delay_ns", *_SPREADS, *_OF_PATH),
 }
 """Keys of the measurement documents that a row may fill, by type; all have station_id besides."""
 
@@ -139,6 +136,8 @@ def measurements_of(row: Mapping[str, str], stations: Mapping[str, str]) -> list
 
 
 def _kinds_of(row: Mapping[str, str]) -> list[str]:
+    if any(key in row for key in _OF_PATH):
+        return ["path"]
     kinds = []
     if "azimuth_deg" in row or "azimuth_clockwise_deg" in row:
         kinds.append("aoa")
@@ -171,8 +170,10 @@ def _document(kind: str, row: Mapping[str, str], stations: Mapping[str, str], *,
         elif name == "elevation_deg":
             value = 90.0 - value
         document[key] = value
-    if kind == "aoa" and "zenith_deg" not in document and not alone:
+    if kind in ("aoa", "path") and "zenith_deg" not in document and not alone:
         document.pop("zenith_stdev_deg", None)
+    if kind == "path" and "azimuth_deg" not in document and not alone:
+        document.pop("azimuth_stdev_deg", None)
     return document
 
 

@@ -1,10 +1,11 @@
 """Fuse the measurements of a report: the product of their likelihoods and of the prior."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from rayfix_service.fusion.measurements.beside import PathsAndTimes, paths_and_times
 from rayfix_service.fusion.measurements.calibrated import with_deviations
 from rayfix_service.fusion.measurements.observations import Observation, SortedReport, sort_report
 from rayfix_service.fusion.measurements.report import Angle, MeasuredPath, Range, Report
@@ -48,11 +49,6 @@ _COARSER_GRID = "the position's surroundings were divided less finely, since the
 _OWN_RULE = (
     "the selection rule of {} was not followed but that of the table, since times on a clock of unknown offset are "
     "located with the table's Gaussians; send paths with toa_m, or times on a known clock"
-)
-
-_BESIDE_PATHS = (
-    "the report has times of arrival or time differences (toa, tdoa) beside paths; give these times as paths with "
-    "toa_m, or with delay_ns"
 )
 
 _NO_GAINS = (
@@ -129,14 +125,14 @@ class Fusion:
             When it was stopped.
         """
         site = site or self.table.site
-        report = with_deviations(report, site)
+        several = paths_and_times(with_deviations(report, site))
+        report = several.report
         sorted_report = sort_report(report, site)
         prior = self._prior(report)
         selections = selections_of(report, site)
         check_gains(selections, self.table)
-        measured = [(n, m) for n, m in enumerate(report.measurements) if isinstance(m, MeasuredPath)]
-        if measured:
-            return self._several(sorted_report, measured, site, prior, stop, selections, report.selection)
+        if several.measured:
+            return self._several(sorted_report, several, site, prior, stop, selections)
         if on_path_map and self._quadrature.suits(sorted_report, selections):
             return self._integrated(sorted_report, prior, stop, selections)
         product = self._multiplied(sorted_report, prior, stop)
@@ -184,26 +180,35 @@ class Fusion:
     def _several(
         self,
         sorted_report: SortedReport,
-        measured: Sequence[tuple[int, MeasuredPath]],
+        several: PathsAndTimes,
         site: SiteInfo,
         prior: Prior,
         stop: Stop,
         selections: Mapping[str, Selection],
-        selection: Selection | None,
     ) -> Product:
         """Integrate the posterior of a report with several paths of a station, and of what else it has."""
-        if sorted_report.num_clocks:
-            raise ReportError(_BESIDE_PATHS, path=("measurements",))
-        for index, path in measured:
+        for index, path in several.measured:
             if not has_gains(self.table, path.station_id):
                 raise ReportError(_NO_GAINS.format(path.station_id), path=("measurements", index))
-        paths = sort_paths(measured, site, within_db=_within_db(selection), spurious_paths=self.settings.spurious_paths)
+        paths = sort_paths(
+            several.measured,
+            site,
+            within_db=_within_db(several.report.selection),
+            spurious_paths=self.settings.spurious_paths,
+            single=several.single,
+        )
         observations = list(sorted_report.observations)
-        unused = dict(sorted_report.unused) | paths.unused
+        unused = {**sorted_report.unused, **paths.unused, **several.unused}
+        unused |= {n: unused[index] for index, n in several.single.items() if n is not None and index in unused}
         if not observations and not paths.indices:
             return Product([], unused, prior, None)
         posterior = self._quadrature.posterior(observations, prior, stop, selections, paths)
-        observations += [Observation(station_id=name, angle_index=index) for name, index in paths.indices]
+        for name, index in paths.indices:
+            if index in several.single:
+                own = Observation(station_id=name, angle_index=several.single[index], timing_indices=(index,))
+            else:
+                own = Observation(station_id=name, angle_index=index)
+            observations.append(own)
         return Product(observations, unused, prior, posterior, (_COARSER_GRID,) if posterior.omitted else ())
 
     def _multiplied(self, sorted_report: SortedReport, prior: Prior, stop: Stop) -> Product:

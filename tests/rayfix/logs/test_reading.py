@@ -46,6 +46,14 @@ LAYOUTS = {
 }
 
 
+PATHS = """target_id;timestamp;station_id;azimuth_deg;elevation_deg;toa_m;power_db;stdev_m
+a;2026-01-31T10:00:00Z;bs1;10;-20;131.5;-60;0.3
+a;2026-01-31T10:00:00Z;bs1;14;-22;133.0;-66;0.3
+a;2026-01-31T10:00:00Z;bs2;;;129.0;;0.3
+a;2026-01-31T10:00:01Z;bs1;11;-20;140.0;-61;0.3
+"""
+
+
 @pytest.mark.parametrize("zipped", [False, True], ids=["plain", "gzip"])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_json_of_every_layout(tmp_path: Path, layout: str, zipped: bool) -> None:
@@ -187,6 +195,35 @@ def test_logs_of_another_kind_are_refused(tmp_path: Path, text: str, columns: Cs
 
 def uudf(n: int, anchor: str, azimuth: int, *, before: str = "") -> str:
     return f'{before}+UUDF:TAG,-53,{azimuth},-6,0,37,"{anchor}","",1437347,{n}'
+
+
+@pytest.mark.parametrize("stated", [{}, {"type": "path"}], ids=["told by columns", "type given"])
+def test_csv_with_a_row_for_each_path(tmp_path: Path, stated: dict[str, str]) -> None:
+    """Rows of one target and time are the paths of one report; a time alone is a path as well."""
+    path = tmp_path / "paths.csv"
+    rows = PATHS.splitlines()
+    if stated:  # where the type says it, a row may not have deviations of angles that it has not
+        rows = [row for row in rows if ";bs2;" not in row]
+    path.write_text("\n".join(rows), encoding="utf-8")
+    values = {"azimuth_stdev_deg": "1", "zenith_stdev_deg": "2", **stated}
+    reports, problems = found(path, Reading(columns=CsvColumns(values=values)))
+    assert problems == []
+    angles = {"azimuth_stdev_deg": 1.0, "zenith_stdev_deg": 2.0, "stdev_m": 0.3}
+    expected = [
+        {"station_id": "bs1", "azimuth_deg": 10.0, "zenith_deg": 110.0, "toa_m": 131.5, "power_db": -60.0, **angles},
+        {"station_id": "bs1", "azimuth_deg": 14.0, "zenith_deg": 112.0, "toa_m": 133.0, "power_db": -66.0, **angles},
+        {"station_id": "bs2", "toa_m": 129.0, "stdev_m": 0.3},
+    ]
+    first = parse_report(
+        {
+            "target_id": "a",
+            "timestamp": "2026-01-31T10:00:00Z",
+            "measurements": [{"type": "path", **each} for each in expected[: 2 if stated else 3]],
+        }
+    )
+    assert reports[0] == first
+    assert len(reports) == 2
+    assert len(reports[1].measurements) == 1
 
 
 def test_ublox_lines_by_their_packets(tmp_path: Path) -> None:

@@ -29,6 +29,9 @@ from rayfix_tables.table import Table
 _FINEST_LENGTH = 0.05
 """Reports with a path length that is more accurate, m, are left to Gaussians: its shells are thin."""
 
+_SETS_LIMITS = GridLimits(least_share=1e-3, resolution=0.3)
+"""For sets of paths, whose information is added up as if all told of one direction."""
+
 NO_SELECTIONS: Mapping[str, Selection] = {}
 """Of stations whose rules are the table's."""
 
@@ -47,7 +50,7 @@ _RANGES_ALONE = 3.0
 _MANY_SHARE, _MANY_FROM = 0.2, 4
 """By how much more each measurement takes for each one beyond so many."""
 
-_SETS_SECONDS, _PATH_SECONDS = 1.5e-2, 2e-3
+_SETS_SECONDS, _PATH_SECONDS = 6e-3, 8e-4
 """What a report of several paths of a station takes, and each of them, s."""
 
 _PREPARING_SECONDS = 1.5e-6
@@ -221,7 +224,9 @@ class Quadrature:
             stop.check()
             stations.append(self._station(each.station_id, selections.get(each.station_id)))
         sets = NO_SETS if paths is None else self._sets(paths, stop)
-        leaves, omitted = integrate(self.tree, stations, factors, prior, self._limits, stop, sets)
+        leaves, omitted = integrate(
+            self.tree, stations, factors, prior, _SETS_LIMITS if sets else self._limits, stop, sets
+        )
         log_all_outlier = sum(float(np.log(factor.outlier)) for factor in factors) + sets.log_all_spurious
         return GridPosterior(leaves=leaves, log_all_outlier=log_all_outlier, omitted=omitted)
 

@@ -3,13 +3,16 @@
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
-from rayfix_service.fusion.quadrature.blocks import BlockPaths, BlockTree, StationPaths
-from rayfix_service.fusion.quadrature.selection import detected_paths, selected_paths
+from rayfix_service.fusion.quadrature.blocks import BlockTree, StationPaths
+from rayfix_service.fusion.quadrature.detection import DetectedPaths, station_detection
+from rayfix_service.fusion.quadrature.selection import selected_paths
 from rayfix_service.fusion.quadrature.spread import spread_paths
 from rayfix_tables.paths import PathMap
 from rayfix_tables.site import Selection
+
+_Found = TypeVar("_Found", StationPaths, DetectedPaths)
 
 
 class Reweighted:
@@ -23,7 +26,7 @@ class Reweighted:
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._kept: OrderedDict[Any, StationPaths] = OrderedDict()
+        self._kept: OrderedDict[Any, Any] = OrderedDict()
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -40,20 +43,22 @@ class Reweighted:
 
     def selected(self, name: str, paths: PathMap, tree: BlockTree, selection: Selection) -> StationPaths:
         """Paths of a station by their probability to be the one that it reports."""
-        return self._found((name, selection), paths, tree, lambda wide: selected_paths(wide, selection))
+        return self._found(
+            (name, selection), lambda: StationPaths(paths, tree, selected_paths(spread_paths(paths), selection))
+        )
 
-    def detected(self, name: str, paths: PathMap, tree: BlockTree, within_db: float) -> StationPaths:
+    def detected(self, name: str, paths: PathMap, tree: BlockTree, within_db: float) -> DetectedPaths:
         """Paths of a station by their probabilities to be reported, where it reports all."""
-        return self._found((name, within_db), paths, tree, lambda wide: detected_paths(wide, within_db))
+        return self._found((name, within_db), lambda: station_detection(paths, tree, within_db))
 
-    def _found(self, key: Any, paths: PathMap, tree: BlockTree, weigh: Callable[[PathMap], BlockPaths]) -> StationPaths:
+    def _found(self, key: Any, work_out: Callable[[], _Found]) -> _Found:
         with self._lock:
-            found = self._kept.get(key)
-            if found is not None:
+            if key in self._kept:
                 self._kept.move_to_end(key)
-                return found
+                kept: _Found = self._kept[key]
+                return kept
         # Two threads may both work it out, which is better than that all wait.
-        found = StationPaths(paths, tree, weigh(spread_paths(paths)))
+        found = work_out()
         with self._lock:
             self._kept[key] = found
             while len(self._kept) > self._most:

@@ -8,7 +8,7 @@ is worked out once per station. With gains g_k, shares lit_k and lengths L_k of 
     first       w_k = p_k prod_{L_j < L_k} (1 - p_j)
     any, all    w_k = p_k / sum_j p_j
 
-For a set of paths (:mod:`rayfix_service.fusion.quadrature.path_sets`) p_k is the probability that a path is reported.
+What is probable of sets of paths is in :mod:`rayfix_service.fusion.quadrature.detection`.
 """
 
 import math
@@ -28,31 +28,23 @@ _EDGE_DB = 1.7
 _LEAST = 1e-4
 """Lighter paths are left out."""
 
-_MOST_DETECTED = 0.95
-"""No path is surer to be reported: scenes are not drawn to the last object, and neighbouring paths interfere."""
-
-_FALL = 0.002
-"""By which fraction a path is less probable to be reported for each decibel that others are stronger."""
-
 _DB = 10.0 / math.log(10.0)
 
 Array = NDArray[np.float64]
 
 
-def detected_paths(paths: PathMap, within_db: float) -> BlockPaths:
-    """Paths to the voxels with the probability that a station reports each of them when it reports all.
+def audible_paths(paths: PathMap, within_db: float) -> tuple[Array, Array]:
+    """Probabilities that paths are audible where they reach, and how much weaker than the strongest each is, dB.
 
     Parameters
     ----------
     paths : PathMap
         With gains.
     within_db : float
-        A path is as likely as not to be reported that is so much weaker than all together.
+        A path is as likely as not to be audible that is so much weaker than all together.
     """
-    voxel, gain, audible = _audible(paths, within_db)
-    below = _DB * (_highest(paths, gain)[voxel] - gain)
-    # Falls a little with the gain where it would be flat, so that the strongest paths come first.
-    return _sorted(paths, _MOST_DETECTED * audible * np.exp(-_FALL * below))
+    voxel, gain, heard = _levels(paths, within_db)
+    return heard, _DB * (_highest(paths, gain)[voxel] - gain)
 
 
 def selected_paths(paths: PathMap, selection: Selection) -> BlockPaths:
@@ -81,13 +73,19 @@ def selected_paths(paths: PathMap, selection: Selection) -> BlockPaths:
 
 def _audible(paths: PathMap, within_db: float) -> tuple[NDArray[np.int64], Array, Array]:
     """Voxel of each path, the natural logarithm of its gain, and its probability to be audible."""
+    voxel, gain, heard = _levels(paths, within_db)
+    return voxel, gain, paths.lit * heard
+
+
+def _levels(paths: PathMap, within_db: float) -> tuple[NDArray[np.int64], Array, Array]:
+    """Voxel of each path, the natural logarithm of its gain, and its probability to be audible where it reaches."""
     voxel = np.repeat(np.arange(len(paths.offsets) - 1), np.diff(paths.offsets))
     gain = paths.log_gain.astype(np.float64) - 2.0 * np.log(_lengths(paths, voxel))
     highest = _highest(paths, gain)
     power = np.bincount(voxel, paths.lit * np.exp(gain - highest[voxel]), len(highest))
     level = highest + np.log(np.maximum(power, 1e-300))
     above = _DB * (gain - level[voxel]) + within_db
-    return voxel, gain, paths.lit / (1.0 + np.exp(np.clip(-above / _EDGE_DB, -50.0, 50.0)))
+    return voxel, gain, 1.0 / (1.0 + np.exp(np.clip(-above / _EDGE_DB, -50.0, 50.0)))
 
 
 def _lengths(paths: PathMap, voxel: NDArray[np.int64]) -> Array:

@@ -1,7 +1,7 @@
 """The measured paths of all stations of a report, as the integration over the free space evaluates them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from rayfix_service.fusion.measurements.directions import (
     without_bias,
 )
 from rayfix_service.fusion.measurements.report import MeasuredPath
-from rayfix_service.fusion.quadrature.blocks import StationPaths
+from rayfix_service.fusion.quadrature.detection import DetectedPaths
 from rayfix_service.fusion.quadrature.observed import measured_direction
 from rayfix_service.fusion.quadrature.path_sets import (
     CLOCK,
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 class StationSet(NamedTuple):
     """Measured paths of a station, and the paths that they may be of, with their probabilities to be reported."""
 
-    paths: StationPaths
+    paths: DetectedPaths
     measured: MeasuredSet
 
 
@@ -70,6 +70,7 @@ class PathSets:
         blocks: NDArray[np.int64],
         spread: float,
         resolution: float,
+        together: float,
         level: int,
         log_likelihood: Array,
         information: Array,
@@ -78,6 +79,8 @@ class PathSets:
 
         Parameters
         ----------
+        together : float
+            Measurements that tell of the same direction.
         level : int
             Size of the blocks, 0 for the smallest.
         """
@@ -85,14 +88,17 @@ class PathSets:
         beams, first = tuple(new_beams(len(points))), 0
         for group in self.groups:
             bits: list[int] = []
-            for paths, measured in group:
+            for detected, measured in group:
+                paths = detected.paths
                 geometry = paths.images, paths.mirrors
                 extend_beams(
                     points,
                     blocks,
                     spread,
                     resolution,
+                    together,
                     tuple(paths.levels[level]),
+                    tuple(detected.detail(level)),
                     geometry,
                     tuple(measured),
                     beams,
@@ -131,6 +137,7 @@ def sort_paths(
     *,
     within_db: float,
     spurious_paths: float,
+    single: Collection[int] = (),
 ) -> SortedPaths:
     """Sort the measured paths of a report by station and clock.
 
@@ -143,6 +150,8 @@ def sort_paths(
         How weak a path may be that a station reports, where its powers do not tell.
     spurious_paths : float
         Number of spurious paths that a station is expected to report.
+    single : collection of int
+        Indices of measured paths that are a set of their own, beside others of their station.
 
     Raises
     ------
@@ -150,7 +159,7 @@ def sort_paths(
         For too many paths, or paths of a station on different clocks.
     """
     unused: dict[int, str] = {}
-    by_station: dict[str, list[tuple[int, MeasuredPath, Direction]]] = {}
+    by_set: dict[tuple[str, int], list[tuple[int, MeasuredPath, Direction]]] = {}
     for index, path in measured:
         station = site.station_by_id[path.station_id]
         direction = NO_DIRECTION
@@ -159,22 +168,22 @@ def sort_paths(
             if not in_field_of_view(station, direction):
                 unused[index] = f"the path lies outside the field of view of station '{station.id}'"
                 continue
-        by_station.setdefault(station.id, []).append((index, path, direction))
+        by_set.setdefault((station.id, index if index in single else -1), []).append((index, path, direction))
     if len(measured) - len(unused) > MOST_MEASURED:
         raise ReportError(
             f"the report has {len(measured)} paths; give at most {MOST_MEASURED}, the strongest",
             path=("measurements", measured[MOST_MEASURED][0]),
         )
-    clocks: dict[Any, list[str]] = {}
-    for name, rows in by_station.items():
-        clock = _clock_of(rows)
-        clocks.setdefault("ue" if clock == "ue" else name, []).append(name)
+    clocks: dict[Any, list[tuple[str, int]]] = {}
+    for key, rows in by_set.items():
+        clocks.setdefault("ue" if _clock_of(rows) == "ue" else key, []).append(key)
     first = min((p.length for _, p in measured if p.clock == "ue" and p.length is not None), default=0.0)
     groups, indices = [], list[tuple[str, int]]()
-    for names in clocks.values():
+    for keys in clocks.values():
         group = []
-        for name in names:
-            rows, station = by_station[name], site.station_by_id[name]
+        for key in keys:
+            rows, name = by_set[key], key[0]
+            station = site.station_by_id[name]
             own = _measured_set(rows, station, site.max_path_length, spurious_paths, first, len(indices))
             group.append((name, span_of([path for _, path, _ in rows], within_db), own))
             indices += [(name, index) for index, _, _ in rows]

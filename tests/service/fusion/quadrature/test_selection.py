@@ -11,39 +11,17 @@ from numpy.typing import NDArray
 
 from rayfix_service.fusion.quadrature.blocks import BlockPaths, BlockTree
 from rayfix_service.fusion.quadrature.reweighted import Reweighted
-from rayfix_service.fusion.quadrature.selection import detected_paths, heaviest_first, none_before, selected_paths
+from rayfix_service.fusion.quadrature.selection import heaviest_first, none_before, selected_paths
 from rayfix_service.fusion.quadrature.spread import spread_paths
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import FixStoppedError, Stop
 from rayfix_service.locator import Locator
 from rayfix_service.wire import InvalidReportError, parse_report, report_to_document
 from rayfix_tables.errors import ReportError
-from rayfix_tables.paths import PathMap
 from rayfix_tables.site import Selection
 from rayfix_tables.table import Table
+from tests.support.tables.one_voxel import LENGTHS, one_voxel
 from tests.support.tables.open_room import POSITIONS, direct_paths, mirrored_room_table, open_room_table, room_space
-
-LENGTHS = np.array([8.0, 2.0, 4.0])
-
-
-def one_voxel(lit: list[float], log_gain: list[float]) -> PathMap:
-    """Return a map of one voxel with paths of the lengths above."""
-    count = len(lit)
-    return PathMap(
-        origin=np.zeros(3),
-        voxel_size=1.0,
-        shape=(1, 1, 1),
-        offsets=np.array([0, count]),
-        sequence=np.arange(count, dtype=np.int32),
-        weight=np.full(count, 1.0 / count, np.float32),
-        excess=np.zeros(0, np.float32),
-        num_walls=np.zeros(0, np.int8),
-        images=0.5 + np.outer(LENGTHS, [1.0, 0.0, 0.0]),
-        mirrors=np.broadcast_to(np.eye(3), (count, 3, 3)),
-        num_reflections=np.zeros(count, np.int8),
-        log_gain=np.array(log_gain, np.float16),
-        lit=np.array(lit, np.float16),
-    )
 
 
 def by_sequence(paths: BlockPaths, count: int = 3) -> NDArray[np.float64]:
@@ -74,15 +52,6 @@ def test_any_takes_audible_paths_alike() -> None:
     np.testing.assert_allclose(by_sequence(loud), [0.4, 0.4, 0.2], rtol=1e-3)
     np.testing.assert_allclose(by_sequence(faint)[1:], [2.0 / 3.0, 1.0 / 3.0], atol=1e-3)
     assert by_sequence(faint)[0] < 1e-3
-
-
-def test_a_path_at_the_limit_is_as_likely_as_not_to_be_reported() -> None:
-    paths = one_voxel([1.0, 1.0, 1.0], [0.0, 0.0, 0.0])
-    gain = 1.0 / LENGTHS**2
-    below = 10.0 * math.log10(gain.sum() / gain[0])
-    found = by_sequence(detected_paths(paths, below))
-    assert found[0] == pytest.approx(0.475, abs=0.015)  # half of the 95 % that no path exceeds
-    assert 0.9 < found[1] < 0.96
 
 
 def test_spreading_against_dictionaries() -> None:
