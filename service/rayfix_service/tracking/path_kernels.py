@@ -240,7 +240,7 @@ def propose(
                 break
             _expect(
                 mean[n],
-                sequence[path],
+                np.int64(sequence[path]),
                 excess[path] if len(excess) > 0 else 0.0,
                 geometry,
                 factor[0],
@@ -271,7 +271,7 @@ def propose(
                 excesses[n] = excess[path] if len(excess) > 0 else 0.0
                 weights[n] = _weight_of(paths, geometry, factor, path)
                 out[n] = np.log(density[m] / total)
-                _expect(mean[n], sequence[path], excesses[n], geometry, factor[0], factor[1], error, slope)
+                _expect(mean[n], np.int64(sequence[path]), excesses[n], geometry, factor[0], factor[1], error, slope)
                 number = _innovate(error, slope, factor, length_variance, c, k, drift, n, scalars)
                 _take_in(mean[n], cov[n], number, scalars)
                 break
@@ -377,7 +377,7 @@ def settle(
         for path in range(first, last):
             longer = excess[path] if len(excess) > 0 else 0.0
             own = _weight_of(paths, geometry, factor, path)
-            _expect(points[n], sequence[path], longer, geometry, factor[0], factor[1], error, slope)
+            _expect(points[n], np.int64(sequence[path]), longer, geometry, factor[0], factor[1], error, slope)
             for c in range(len(spreads)):
                 for k in range(len(kinds)):
                     if count == _MOST:

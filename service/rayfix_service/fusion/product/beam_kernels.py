@@ -190,7 +190,8 @@ def _order(log_scale: Any, offsets: Any) -> Any:
     for factor in range(len(total)):
         total[factor] = log_scale[offsets[factor] : offsets[factor + 1]].sum()
     by_total = np.argsort(total, kind="mergesort")
-    return by_total[np.argsort(np.diff(offsets)[by_total], kind="mergesort")]
+    count = np.diff(offsets)[by_total].astype(np.float64)  # of the type of total, so that one sort is compiled
+    return by_total[np.argsort(count, kind="mergesort")]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -137,7 +137,9 @@ def make_alternatives(
         value[out] = own_log[left] + part["log_clocks"]
         done = out.stop
         if done > most:
-            best = np.sort(np.argsort(-value[:done], kind="mergesort")[:most])
+            is_best = np.zeros(done, np.bool_)
+            is_best[np.argsort(-value[:done], kind="mergesort")[:most]] = True
+            best = np.flatnonzero(is_best)
             for row in range(len(columns)):
                 columns[row, :most] = columns[row, best]
             outlier[:most], value[:most] = outlier[best], value[best]

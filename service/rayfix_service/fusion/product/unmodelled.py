@@ -44,8 +44,6 @@ _RATIO = 1.6
 _NEAREST = 0.5
 """Distance of the first slice's end, m."""
 
-_NO_READINGS = np.empty(0, READING)
-
 Array = NDArray[np.float64]
 
 
@@ -209,7 +207,8 @@ def unmodelled_columns(path: Any, farthest: Any, dimension: Any) -> Any:
     """Return the same as functions of the state, as ``information_form`` has them, shape (rows, n)."""
     log_mass, mean, cov = unmodelled_gaussians(path, farthest)
     columns = np.empty((triangle(dimension) + dimension + 1, len(log_mass)))
-    to_columns(log_mass, mean, cov, _NO_READINGS, dimension, columns)
+    # A slice, and readings that could be written to: as make_alternatives has them, so that one is compiled for both.
+    to_columns(log_mass, mean, cov, np.empty(0, READING), dimension, columns[:, : len(log_mass)])
     return columns
 
 

@@ -184,8 +184,12 @@ def _joined(
                             sums[at, 2] += held * num_walls[n]
         if free > 0.0:
             order = np.argsort(-sums[begin:total, 0])
-            new_sequence[begin:total] = new_sequence[begin:total][order]
-            sums[begin:total] = sums[begin:total][order]
+            # Loops, since numba compiles a message with shapes for the assignment of an array to a slice.
+            found, their_sums = new_sequence[begin:total].copy(), sums[begin:total].copy()
+            for n in range(total - begin):
+                new_sequence[begin + n] = found[order[n]]
+                for column in range(3):
+                    sums[begin + n, column] = their_sums[order[n], column]
             while total > begin and sums[total - 1, 0] < _LEAST_WEIGHT * sums[begin, 0]:
                 total -= 1
             for n in range(begin, total):
