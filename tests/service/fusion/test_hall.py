@@ -351,6 +351,18 @@ def test_a_range_longer_than_any_path_contradicts_the_table(hall: Hall) -> None:
     assert fix.outcomes[0].outlier_probability == pytest.approx(1.0)
 
 
+def test_no_region_is_larger_than_the_building(hall: Hall) -> None:
+    """A time of 4 us beside an angle gave a radius of 1.8 km: nanoseconds for metres are a common mistake."""
+    angle = Angle(station_id="bs1", azimuth=0.9, zenith=1.7, azimuth_stdev=0.02, zenith_stdev=0.02)
+    fix = hall.locator.locate(Report(measurements=(angle, Range(station_id="bs1", path_length=1200.0, stdev=1.5))))
+    assert fix.status == "inconsistent"
+    assert fix.regions is not None
+    across = math.hypot(8.0, 18.0)
+    assert 0.5 * across < fix.regions.horizontal_radius(0.68) < across + 0.5
+    assert fix.regions.vertical_half_height(0.68) < 2.8
+    assert np.sqrt(np.diag(best(fix).covariance)).max() < 18.5
+
+
 def test_one_wide_angle_alone_is_no_position(hall: Hall) -> None:
     """It may have come from half of the hall, which is one mode wider than a position may be."""
     stdev = math.radians(40.0)

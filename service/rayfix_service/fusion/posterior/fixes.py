@@ -1,23 +1,30 @@
 """Summarise the hypotheses of a report in a fix."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rayfix_service.fusion.measurements.observations import Observation
 from rayfix_service.fusion.measurements.report import Report
 from rayfix_service.fusion.posterior.credible import CredibleRegions
 from rayfix_service.fusion.posterior.fix import Candidate, Fix, Outcome, Status
+from rayfix_service.fusion.posterior.points import ListedPoints
 from rayfix_service.fusion.posterior.summary import ReportPosterior
 from rayfix_service.fusion.product.beam import Hypotheses
 from rayfix_service.fusion.product.outliers import outlier_index
 from rayfix_service.fusion.product.prior import Prior
 from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
+from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.table import Table
 
 _LEAST_CANDIDATE = 1e-3
 """Candidates less probable than this are left out of the fix."""
+
+_NUM_ANYWHERE = 1000
+"""Points that stand for a position of which nothing is known, about."""
 
 
 class Product(NamedTuple):
@@ -83,7 +90,11 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
         else:
             log_evidence, share = summary.log_evidence, 1.0 - summary.lost
             candidates = tuple(
-                Candidate(probability=p * share, position=summary.position[n], covariance=summary.moment[n])
+                Candidate(
+                    probability=p * share,
+                    position=summary.position[n],
+                    covariance=_within(summary.moment[n], summary.position[n], space),
+                )
                 for n, p in enumerate(summary.probability.tolist())
                 if p > _LEAST_CANDIDATE or n == 0
             )
@@ -93,7 +104,7 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
             regions = CredibleRegions(
                 position=best.position,
                 covariance=best.covariance,
-                points=summary.points,
+                points=summary.points if best.covariance is summary.moment[0] else _anywhere(space),
                 share=share,
                 stretch=settings.inconsistent_stretch if status == "inconsistent" else 1.0,
             )
@@ -118,6 +129,23 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
         target_id=report.target_id,
         timestamp=report.timestamp,
     ).moved(table.scene.origin)
+
+
+def _within(covariance: NDArray[np.float64], position: NDArray[np.float64], space: FreeSpace) -> NDArray[np.float64]:
+    """Return a covariance; that of a position anywhere where it reaches beyond the building."""
+    size = math.hypot(*space.free.shape) * space.voxel_size
+    if covariance.trace() <= (0.5 * size) ** 2:  # from anywhere, the farthest corner is as far at least
+        return covariance
+    ends = np.stack([space.origin, space.origin + space.voxel_size * np.array(space.free.shape)])
+    most = np.abs(ends - position).max(axis=0) ** 2
+    return covariance if covariance.trace() <= most.sum() else np.diag(most)
+
+
+def _anywhere(space: FreeSpace) -> ListedPoints:
+    """Return points all over the free space, for a posterior that lies beyond the building."""
+    voxels = np.argwhere(space.free)
+    step = max(1, len(voxels) // _NUM_ANYWHERE)
+    return ListedPoints(position=space.origin + space.voxel_size * (voxels[::step] + 0.5))
 
 
 def _status(candidates: tuple[Candidate, ...], half_bad: float, anywhere: float, settings: FusionSettings) -> Status:
