@@ -83,6 +83,7 @@ NOT_IN_IDENTITY = {
     "offline.scene.walls.Walls.reflected": DEFINITION,
     "offline.scene.walls.Walls.transmitted": DEFINITION,
     "offline.twin.enclosures.find_enclosures": BY_CHECKSUM,
+    "offline.twin.findings.HIGH_ROOM": CHECK_ONLY,
     "offline.twin.findings.LARGE_SCENE": CHECK_ONLY,
     "offline.twin.findings.SMALL_SCENE": CHECK_ONLY,
     "offline.scene.engine.FAR": BY_CHECKSUM,

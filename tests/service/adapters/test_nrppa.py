@@ -381,7 +381,7 @@ def set_at(document: Any, *path: Any) -> dict[str, Any]:
     ("path", "words"),
     [
         ((RESPONSE, 0, "tRP-ID", 0), f"['{RESPONSE}'][0]['tRP-ID'] is 0; give a TRP-ID, an integer from 1 to 65535"),
-        ((RESPONSE, 0, "tRP-ID", "7"), "is '7'; give a TRP-ID"),
+        ((RESPONSE, 0, "tRP-ID", "7"), "is the text '7'; give a TRP-ID"),
         ((RESPONSE, 0, "measurementResult", []), "is an array of length 0; give an array of 1 to 256 measurements"),
         ((RESPONSE, []), "is an array of length 0; give an array of 1 to 64"),
         ((RESPONSE, 0, 5), f"['{RESPONSE}'][0] is 5; give a JSON object"),

@@ -100,7 +100,7 @@ def test_the_way_back(azimuth: float, elevation: float):
         (without("azimuth_stdev"), "angles[0].azimuth_stdev is missing; give a standard deviation in degrees"),
         (without("elevation_stdev"), "angles[0].elevation_stdev is missing; give elevation and elevation_stdev"),
         (without(elevation=90.5), "angles[0].elevation is 90.5; give an elevation in degrees, -90 to 90"),
-        (without(azimuth="30"), "angles[0].azimuth is '30'; give an azimuth"),
+        (without(azimuth="30"), "angles[0].azimuth is the text '30'; give an azimuth"),
         (without(azimuth=math.nan), "angles[0].azimuth is NaN"),
         (without(distance=-1.0), "angles[0].distance is -1.0; give a distance in metres"),
         (without(sequence=1.5), "angles[0].sequence is 1.5; give the sequence number"),
