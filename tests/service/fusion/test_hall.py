@@ -361,6 +361,9 @@ def test_no_region_is_larger_than_the_building(hall: Hall) -> None:
     assert 0.5 * across < fix.regions.horizontal_radius(0.68) < across + 0.5
     assert fix.regions.vertical_half_height(0.68) < 2.8
     assert np.sqrt(np.diag(best(fix).covariance)).max() < 18.5
+    usual = hall.locator.locate(hall.report(0, "toa")).regions
+    assert usual is not None
+    assert usual.horizontal_radius(0.68) < 1.0
 
 
 def test_one_wide_angle_alone_is_no_position(hall: Hall) -> None:

@@ -104,7 +104,7 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
             regions = CredibleRegions(
                 position=best.position,
                 covariance=best.covariance,
-                points=summary.points if best.covariance is summary.moment[0] else _anywhere(space),
+                points=_anywhere(space) if _is_beyond(summary.moment[0], best.position, space) else summary.points,
                 share=share,
                 stretch=settings.inconsistent_stretch if status == "inconsistent" else 1.0,
             )
@@ -133,12 +133,21 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
 
 def _within(covariance: NDArray[np.float64], position: NDArray[np.float64], space: FreeSpace) -> NDArray[np.float64]:
     """Return a covariance; that of a position anywhere where it reaches beyond the building."""
+    return np.diag(_farthest(position, space) ** 2) if _is_beyond(covariance, position, space) else covariance
+
+
+def _is_beyond(covariance: NDArray[np.float64], position: NDArray[np.float64], space: FreeSpace) -> bool:
+    """Whether a second moment about a position is larger than that of any density in the building."""
     size = math.hypot(*space.free.shape) * space.voxel_size
     if covariance.trace() <= (0.5 * size) ** 2:  # from anywhere, the farthest corner is as far at least
-        return covariance
+        return False
+    return bool(covariance.trace() > (_farthest(position, space) ** 2).sum())
+
+
+def _farthest(position: NDArray[np.float64], space: FreeSpace) -> NDArray[np.float64]:
+    """Return the distances along x, y and z, m, to the farthest corner."""
     ends = np.stack([space.origin, space.origin + space.voxel_size * np.array(space.free.shape)])
-    most = np.abs(ends - position).max(axis=0) ** 2
-    return covariance if covariance.trace() <= most.sum() else np.diag(most)
+    return np.asarray(np.abs(ends - position).max(axis=0))
 
 
 def _anywhere(space: FreeSpace) -> ListedPoints:
