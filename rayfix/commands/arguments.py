@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 AddCommand = Callable[[str, Callable[[argparse.Namespace], int], str], argparse.ArgumentParser]
 """Adds a command, given its name, the function that it runs, and its help text."""
 
+TABLE_SUFFIXES = (".h5", ".hdf5")
+"""How names of tables end."""
+
 _Number = TypeVar("_Number", int, float)
 
 _OUTPUTS = ("native", "3gpp", "omlox")

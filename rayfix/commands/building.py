@@ -6,11 +6,15 @@ import json
 import sys
 from pathlib import Path
 
-from rayfix.commands.arguments import AddCommand, add_jobs_argument, add_progress_argument, mass_share
+from rayfix.commands.arguments import (
+    TABLE_SUFFIXES,
+    AddCommand,
+    add_jobs_argument,
+    add_progress_argument,
+    mass_share,
+)
 from rayfix.errors import BuildError
 from rayfix.extras import needs_extra
-
-_TABLES = (".h5", ".hdf5")
 
 
 def add_commands(add: AddCommand) -> None:
@@ -67,8 +71,8 @@ def _build(options: argparse.Namespace) -> int:
     from rayfix.console import print_build_summary
     from rayfix.progress import build_progress
 
-    if options.output.suffix.lower() not in _TABLES and not options.output.exists():
-        raise BuildError(f"{options.output} is not a valid name of a table; end it in {_TABLES[0]}")
+    if options.output.suffix.lower() not in TABLE_SUFFIXES and not options.output.exists():
+        raise BuildError(f"{options.output} is not a valid name of a table; end it in {TABLE_SUFFIXES[0]}")
 
     with build_progress(enabled=not options.no_progress) as progress:
         summary = build_table(

@@ -8,7 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rayfix.commands.arguments import AddCommand, add_jobs_argument, add_progress_argument, at_least_one
+from rayfix.commands.arguments import (
+    TABLE_SUFFIXES,
+    AddCommand,
+    add_jobs_argument,
+    add_progress_argument,
+    at_least_one,
+)
 from rayfix.commands.logs import add_source_arguments, log_reading
 from rayfix.errors import ReportError
 from rayfix.extras import needs_extra
@@ -68,7 +74,7 @@ def _compare(options: argparse.Namespace) -> int:
 
 def _sorted(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """Tell tables, which are HDF5, from logs."""
-    tables = [path for path in files if path.suffix.lower() in (".h5", ".hdf5") or _is_hdf5(path)]
+    tables = [path for path in files if path.suffix.lower() in TABLE_SUFFIXES or _is_hdf5(path)]
     logs = [path for path in files if path not in tables]
     if len(tables) < 2:
         number = "1 of the files is a table" if tables else "none of the files is a table"

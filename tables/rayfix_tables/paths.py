@@ -1,7 +1,7 @@
 """The paths from a station to each place: which there are, and which of them the station reports."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -78,6 +78,29 @@ class PathMap:
     def __len__(self) -> int:
         """Return the number of paths."""
         return len(self.sequence)
+
+    def rearranged(self, offsets: NDArray[np.int64], source: NDArray[np.int64], lit: NDArray[np.floating]) -> "PathMap":
+        """Return a map of copies of these paths, to other voxels too, with weights of 0.
+
+        Parameters
+        ----------
+        offsets : ndarray of int64, shape (n_voxels + 1,)
+            Of the new map.
+        source : ndarray of int64, shape (n,)
+            The path that each of its paths is a copy of.
+        lit : ndarray of shape (n,)
+        """
+        passes = len(self.excess) > 0
+        return replace(
+            self,
+            offsets=offsets,
+            sequence=self.sequence[source],
+            weight=np.zeros(len(source), np.float32),
+            excess=self.excess[source] if passes else self.excess,
+            num_walls=self.num_walls[source] if passes else self.num_walls,
+            log_gain=self.log_gain[source],
+            lit=lit.astype(np.float16),
+        )
 
     @property
     def num_bytes(self) -> int:

@@ -101,21 +101,7 @@ def detected_paths(paths: PathMap, within_db: float) -> tuple[BlockPaths, Detect
     )
     passes = len(paths.excess) > 0
     lit = corners.mean(axis=1)
-    wide = PathMap(
-        origin=paths.origin,
-        voxel_size=paths.voxel_size,
-        shape=paths.shape,
-        offsets=offsets,
-        sequence=paths.sequence[source],
-        weight=np.zeros(len(source), np.float32),
-        excess=paths.excess[source] if passes else np.zeros(0, np.float32),
-        num_walls=paths.num_walls[source] if passes else np.zeros(0, np.int8),
-        images=paths.images,
-        mirrors=paths.mirrors,
-        num_reflections=paths.num_reflections,
-        log_gain=paths.log_gain[source],
-        lit=lit.astype(np.float16),
-    )
+    wide = paths.rearranged(offsets, source, lit)
     audible, below = audible_paths(wide, within_db)
     # Falls a little with the gain where it would be flat, so that the strongest paths come first.
     audible *= _MOST_DETECTED * np.exp(-_FALL * below)

@@ -27,22 +27,7 @@ def spread_paths(paths: PathMap) -> PathMap:
     offsets, source, lit = _spread(
         paths.offsets, paths.sequence, paths.lit.astype(np.float32), np.array(paths.shape), len(paths.images), _ASIDE
     )
-    passes = len(paths.excess) > 0
-    return PathMap(
-        origin=paths.origin,
-        voxel_size=paths.voxel_size,
-        shape=paths.shape,
-        offsets=offsets,
-        sequence=paths.sequence[source],
-        weight=np.zeros(len(source), np.float32),
-        excess=paths.excess[source] if passes else np.zeros(0, np.float32),
-        num_walls=paths.num_walls[source] if passes else np.zeros(0, np.int8),
-        images=paths.images,
-        mirrors=paths.mirrors,
-        num_reflections=paths.num_reflections,
-        log_gain=paths.log_gain[source],
-        lit=lit.astype(np.float16),
-    )
+    return paths.rearranged(offsets, source, lit)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,8 +1,8 @@
 /** Measurements less what the calibration of their stations has found, as the fusion takes them. */
 
+import { METRES_PER_NANOSECOND } from "./numeric";
 import type { Calibration, Measurement, StationInfo } from "./types";
 
-const METRES_PER_NANOSECOND = 0.299792458;
 const LENGTHS = ["range_m", "range_difference_m", "toa_m"] as const;
 const DELAYS = ["delay_ns", "delay_difference_ns", "round_trip_ns", "toa_ns"] as const;
 

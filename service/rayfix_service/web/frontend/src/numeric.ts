@@ -3,6 +3,7 @@
 import type { Matrix3, Point, StationInfo, Vec3 } from "./types";
 
 export const DEG = Math.PI / 180;
+export const METRES_PER_NANOSECOND = 0.299792458;
 
 export const vec = (p: Point): Vec3 => [p.x, p.y, p.z];
 export const add = (a: Vec3, b: Vec3, s = 1): Vec3 => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];

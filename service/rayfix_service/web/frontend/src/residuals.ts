@@ -1,13 +1,11 @@
 /** From a report and its fix: the paths that explain it, and what is left over of each measurement. */
 
 import { calibrated } from "./calibrated";
-import { DEG, add, anglesOf, direction, localToScene, multiply, sub, transpose, vec, wrap } from "./numeric";
+import { DEG, METRES_PER_NANOSECOND, add, anglesOf, direction, localToScene, multiply, sub, transpose, vec, wrap } from "./numeric";
 import { signed, withDeviation } from "./rounding";
 import { explain, type Explanation, type Heard } from "./trace/explain";
 import type { Mirrors } from "./trace/mirrors";
 import type { Fix, Measurement, Report, Site, StationInfo, Vec3 } from "./types";
-
-const METRES_PER_NANOSECOND = 0.299792458;
 
 export interface Residual {
   measurement: Measurement;
