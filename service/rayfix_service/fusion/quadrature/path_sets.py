@@ -26,7 +26,7 @@ from rayfix_service.fusion.quadrature.factor import _angle_of
 MOST_MEASURED = 62
 """Measured paths of a report: each is a bit of a hypothesis."""
 
-_BEAM, _COARSE_BEAM = 12, 4
+_BEAM, _COARSE_BEAM = 24, 4
 """Hypotheses of a point that are kept, and of one that stands for a large block, which only tells where to look."""
 
 _MOST_CANDIDATES = 62

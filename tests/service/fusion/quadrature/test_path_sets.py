@@ -126,7 +126,7 @@ def test_the_beam_is_the_sum_over_all_assignments(clock: str, kinds: list[str]) 
         # Times on the UE's clock count from the first one; a flat offset does not mind.
         offsets = np.zeros(1) if clock == "known" else np.arange(-20.0, 30.0, 0.01)
         found, _ = evaluated(measured, 0.3)
-        assert found == pytest.approx(log_density(measured, offsets, 0.3), abs=5e-3)
+        assert found == pytest.approx(log_density(measured, offsets, 0.3), abs=2e-3)
 
 
 def test_a_large_block_is_as_good_where_little_is_open() -> None:
@@ -155,10 +155,10 @@ def test_a_path_from_nowhere_is_spurious() -> None:
 
 
 def test_hypotheses_that_are_left_out_hardly_matter() -> None:
-    """Lengths alone fit several paths: thirty assignments, of which twelve stand for all to three per cent."""
+    """Lengths alone fit several paths: of more assignments than are kept, the best stand for all to half a per cent."""
     measured = noisy(np.random.default_rng(5), ["L"] * 3, "ue", 5.0)
     found, _ = evaluated(measured, 3.0)
-    assert found == pytest.approx(log_density(measured, np.arange(-20.0, 30.0, 0.01), 3.0), abs=0.03)
+    assert found == pytest.approx(log_density(measured, np.arange(-20.0, 30.0, 0.01), 3.0), abs=5e-3)
 
 
 @pytest.mark.parametrize(("clock", "offset"), [("range_m", 0.0), ("toa_m", 1234.5), ("delay_ns", 0.0)])
