@@ -1,5 +1,6 @@
 """Building on a real Dask scheduler with worker processes of its own, one of which is killed."""
 
+import json
 import subprocess
 import sys
 import time
@@ -48,9 +49,17 @@ class Processes:
         self.file = folder / "scheduler.json"
         self._start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
         deadline = time.monotonic() + 60
-        while not self.file.exists():
+        while not self._is_written():
             assert time.monotonic() < deadline, "the scheduler did not start"
             time.sleep(0.05)
+
+    def _is_written(self) -> bool:
+        """Say whether the scheduler's file is there as a whole: it appears empty and is then written."""
+        try:
+            json.loads(self.file.read_text(encoding="utf-8"))
+        except (FileNotFoundError, json.JSONDecodeError):
+            return False
+        return True
 
     def _start(self, module: str, *options: str, before: str = "") -> "subprocess.Popen[bytes]":
         script = f"{before}\nfrom distributed.cli.{module} import main\nmain()"
@@ -68,8 +77,6 @@ class Processes:
 
     def address(self, workers: int) -> str:
         """Wait for workers and return the scheduler's address."""
-        import json
-
         from distributed import Client
 
         address = str(json.loads(self.file.read_text(encoding="utf-8"))["address"])
