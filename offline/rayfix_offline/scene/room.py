@@ -43,4 +43,10 @@ def wall_remarks(site: SiteFile) -> tuple[Remark, ...]:
     if not on_walls:
         return ()
     problem = f"{', '.join(on_walls)}: on a wall of the room, moved off it by {1e3 * OFF_WALL:g} mm"
-    return (Remark(kind="on a wall", problem=problem, remedy="nothing needs to be done"),)
+    return (
+        Remark(
+            kind="on a wall",
+            problem=problem,
+            remedy="where a millimetre counts, state the positions of the antennas themselves",
+        ),
+    )

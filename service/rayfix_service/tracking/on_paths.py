@@ -46,8 +46,8 @@ class Measured(NamedTuple):
         Station, and number among its paths in the report.
     map, around : StationMap
         Of the paths to a place, and of those to somewhere around it.
-    factor : tuple
-        Of :class:`.quadrature.factor.PathFactor`.
+    values : tuple
+        Fields of a :class:`.quadrature.factor.PathFactor`, and the variance of the length, m2.
     whole : ndarray of shape (3,)
         Variances of azimuth and zenith, rad2, and of the length, m2; 0 for what was not measured.
     process : Process
@@ -57,7 +57,7 @@ class Measured(NamedTuple):
     key: Key
     map: StationMap
     around: StationMap
-    factor: tuple[Any, ...]
+    values: tuple[tuple[Any, ...], float]
     whole: Array
     process: Process
 
@@ -105,14 +105,15 @@ class Stations:
             finite = factor.kinds[np.isfinite(factor.kinds[:, 3]), 3]
             length = float(finite.min()) if len(finite) else 0.0
             whole = np.array([factor.cov[0], factor.cov[2], length])
+            whole = np.where(np.isfinite(whole), whole, 0.0)
             found.append(
                 Measured(
                     key=(station, number),
                     map=near,
                     around=around,
                     # Here a path that the table does not know is an outlier.
-                    factor=tuple(factor[:-1]),
-                    whole=np.where(np.isfinite(whole), whole, 0.0),
+                    values=(tuple(factor[:-1]), length),
+                    whole=whole,
                     process=self.processes[station],
                 )
             )

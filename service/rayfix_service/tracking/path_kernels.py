@@ -34,23 +34,38 @@ def voxel_of(place: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _expect(at: Any, s: Any, excess: Any, geometry: Any, turn: Any, zenith: Any, error: Any, slope: Any) -> None:
-    """Fill in the expected azimuth and zenith minus the measured ones, the path length, and the gradients of all."""
+def _seen(at: Any, s: Any, geometry: Any, turn: Any) -> Any:
+    """Way from a sequence's image to a place, in the scene's axes and in those of the measured angles."""
     images, mirrors, _ = geometry
     d0, d1, d2 = at[0] - images[s, 0], at[1] - images[s, 1], at[2] - images[s, 2]
-    square = max(d0 * d0 + d1 * d1 + d2 * d2, _NEAR)
-    length = np.sqrt(square)
     a = mirrors[s, 0, 0] * d0 + mirrors[s, 1, 0] * d1 + mirrors[s, 2, 0] * d2
     b = mirrors[s, 0, 1] * d0 + mirrors[s, 1, 1] * d1 + mirrors[s, 2, 1] * d2
     c = mirrors[s, 0, 2] * d0 + mirrors[s, 1, 2] * d1 + mirrors[s, 2, 2] * d2
     u = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c
     v = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c
     w = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c
+    return d0, d1, d2, u, v, w
+
+
+@numba.njit(cache=True, nogil=True)
+def _expect(at: Any, s: Any, excess: Any, geometry: Any, factor: Any, error: Any) -> None:
+    """Fill in the expected azimuth and zenith minus the measured ones, and the path length."""
+    _, _, _, u, v, w = _seen(at, s, geometry, factor[0])
+    square = max(u * u + v * v + w * w, _NEAR)
+    error[0] = np.arctan2(v, u)
+    error[1] = np.arctan2(np.sqrt(max(u * u + v * v, 1e-6 * square)), w) - factor[1]
+    error[2] = np.sqrt(square) + excess
+
+
+@numba.njit(cache=True, nogil=True)
+def _differentiate(at: Any, s: Any, geometry: Any, turn: Any, slope: Any) -> None:
+    """Fill in the gradients of what is expected."""
+    mirrors = geometry[1]
+    d0, d1, d2, u, v, w = _seen(at, s, geometry, turn)
+    square = max(d0 * d0 + d1 * d1 + d2 * d2, _NEAR)
+    length = np.sqrt(square)
     horizontal = max(u * u + v * v, 1e-6 * square)
     across = np.sqrt(horizontal)
-    error[0] = np.arctan2(v, u)
-    error[1] = np.arctan2(across, w) - zenith
-    error[2] = length + excess
     ja, jb = -v / horizontal, u / horizontal
     za, zb, zc = u * w / (across * square), v * w / (across * square), -across / square
     for i in range(3):
@@ -101,6 +116,17 @@ def _innovate(
 
 
 @numba.njit(cache=True, nogil=True)
+def _log_density(count: Any, scalars: Any) -> Any:
+    """Log density of independent scalars at a position."""
+    left, _, noise = scalars
+    square, product = 0.0, 1.0
+    for m in range(count):
+        square += left[m] ** 2 / noise[m]
+        product *= 2.0 * np.pi * noise[m]
+    return -0.5 * (square + np.log(product))
+
+
+@numba.njit(cache=True, nogil=True)
 def _take_in(mean: Any, cov: Any, count: Any, scalars: Any) -> Any:
     """Update a Gaussian with independent scalars, in place; returns the log density of these.
 
@@ -136,18 +162,18 @@ def _weight_of(paths: Any, geometry: Any, factor: Any, path: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _weight_at(point: Any, place: Any, paths: Any, geometry: Any, factor: Any, s: Any) -> Any:
-    """Weight of a sequence at a point, interpolated between the centres of the voxels that have any path.
+def _around(point: Any, place: Any, paths: Any, voxels: Any, shares: Any) -> Any:
+    """Fill in the voxels with any path between whose centres a point lies, and their shares; returns their number.
 
     Weights of voxels are of few rays each, and end at the edges of shadows: as steps they would draw particles.
     """
     origin, size, shape = place
-    offsets, sequence = paths[0], paths[1]
+    offsets = paths[0]
     u = (point[0] - origin[0]) / size - 0.5
     v = (point[1] - origin[1]) / size - 0.5
     w = (point[2] - origin[2]) / size - 0.5
     i, j, k = np.int64(np.floor(u)), np.int64(np.floor(v)), np.int64(np.floor(w))
-    total, near = 0.0, 0.0
+    count, total = 0, 0.0
     for x in range(i, i + 2):
         for y in range(j, j + 2):
             for z in range(k, k + 2):
@@ -156,12 +182,43 @@ def _weight_at(point: Any, place: Any, paths: Any, geometry: Any, factor: Any, s
                 voxel = (x * shape[1] + y) * shape[2] + z
                 if offsets[voxel] == offsets[voxel + 1]:
                     continue
-                share = (1.0 - abs(u - x)) * (1.0 - abs(v - y)) * (1.0 - abs(w - z))
-                near += share
-                for path in range(offsets[voxel], offsets[voxel + 1]):
-                    if sequence[path] == s:
-                        total += share * _weight_of(paths, geometry, factor, path)
-    return total / near if near > 0.0 else 0.0
+                voxels[count] = voxel
+                shares[count] = (1.0 - abs(u - x)) * (1.0 - abs(v - y)) * (1.0 - abs(w - z))
+                total += shares[count]
+                count += 1
+    if total <= 0.0:
+        return 0
+    for n in range(count):
+        shares[n] /= total
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _weigh(count: Any, voxels: Any, shares: Any, paths: Any, geometry: Any, factor: Any, s: Any, weighed: Any) -> Any:
+    """Fill in the voxels' shares of the weight of a sequence, or of an outlier's of 1; returns their sum."""
+    offsets, sequence = paths[0], paths[1]
+    total = 0.0
+    for n in range(count):
+        own = 0.0
+        if s == _OUTLIER:
+            own = 1.0
+        else:
+            for path in range(offsets[voxels[n]], offsets[voxels[n] + 1]):
+                if sequence[path] == s:
+                    own += _weight_of(paths, geometry, factor, path)
+        weighed[n] = shares[n] * own
+        total += weighed[n]
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _picked(weights: Any, count: Any, level: Any) -> Any:
+    """Find the weight within which a level lies, counted from the first; -1 where it lies beyond the last."""
+    for n in range(count):
+        level -= weights[n]
+        if level <= 0.0:
+            return n
+    return -1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -180,19 +237,54 @@ def _highest(factor: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
+def _densities(
+    at: Any, cov: Any, exact: Any, of: Any, voxel: Any, of_map: Any, measured: Any, drift: Any, out: Any
+) -> Any:
+    """Evaluate all components of an observation for a Gaussian over the position; returns their number and sum.
+
+    Where the position is ``exact``, the covariance does not count. The sum has the outlier in it. ``out`` gets the
+    densities, and each one's path, Gaussian of the angles and Gaussian of the times.
+    """
+    _, paths, geometry = of_map
+    factor, length_variance = measured
+    offsets, sequence, weight, excess, _ = paths
+    spreads, kinds, outlier = factor[3], factor[4], factor[7]
+    density, component = out
+    sine = 1.0 if np.isnan(factor[1]) else np.sin(factor[1])
+    error, slope = np.empty(3), np.empty((3, 3))
+    scalars = np.empty(3), np.empty((3, 3)), np.empty(3)
+    trial, trial_cov = np.empty(3), np.empty((3, 3))
+    peak, total, count = _highest(factor), outlier, 0
+    first, last = (offsets[voxel], offsets[voxel + 1]) if voxel >= 0 else (0, 0)
+    for path in range(first, last):
+        if float(weight[path]) * peak < _NEGLIGIBLE * total:
+            break
+        own = _weight_of(paths, geometry, factor, path)
+        longer = excess[path] if len(excess) > 0 else 0.0
+        _expect(at, np.int64(sequence[path]), longer, geometry, factor, error)
+        if not exact:
+            _differentiate(at, np.int64(sequence[path]), geometry, factor[0], slope)
+        for c in range(len(spreads)):
+            for k in range(len(kinds)):
+                if count == _MOST:
+                    continue
+                number = _innovate(error, slope, factor, length_variance, c, k, drift, of, scalars)
+                if exact:
+                    log = _log_density(number, scalars)
+                else:
+                    trial[:] = at
+                    trial_cov[:] = cov
+                    log = _take_in(trial, trial_cov, number, scalars)
+                density[count] = own * spreads[c, 0] * kinds[k, 1] * np.exp(log) / sine
+                component[count, 0], component[count, 1], component[count, 2] = path, c, k
+                total += density[count]
+                count += 1
+    return count, total
+
+
+@numba.njit(cache=True, nogil=True)
 def propose(
-    mean: Any,
-    cov: Any,
-    home: Any,
-    place: Any,
-    paths: Any,
-    geometry: Any,
-    factor: Any,
-    length_variance: Any,
-    drift: Any,
-    uniform: Any,
-    chosen: Any,
-    out: Any,
+    mean: Any, cov: Any, home: Any, of_map: Any, measured: Any, drift: Any, uniform: Any, chosen: Any, out: Any
 ) -> None:
     """Draw a component of an observation for each particle by its probability, and take it in to first order.
 
@@ -203,92 +295,64 @@ def propose(
         Gaussians over the positions, changed in place.
     home : ndarray of shape (n, 3), m
         Whose paths are taken where a mean lies beyond the map.
-    place, paths, geometry, factor : tuple
+    of_map : tuple
         Origin, voxel size and shape of the map; its paths as in :class:`.quadrature.blocks.BlockPaths`; images, mirrors
-        and numbers of reflections; :class:`.quadrature.factor.PathFactor`.
-    length_variance : float, m2
-        Variance of a path length's error, of which the drift has its share.
+        and numbers of reflections.
+    measured : tuple
+        :class:`.quadrature.factor.PathFactor`, and the variance of a path length's error, m2, of which the drift has
+        its share.
     drift : tuple
         Means and variances of the drifts of azimuth, zenith and length, shape (n, 3), and their share of the variance,
         shape (n,).
-    uniform : ndarray of shape (n,)
-        Random numbers between 0 and 1.
+    uniform : ndarray of shape (n,) or (0,)
+        Random numbers between 0 and 1; empty where the components are given.
     chosen : tuple of ndarrays of shape (n,)
-        Filled with sequences, -1 for an outlier, the path's excess length and its weight, and the numbers of both
-        Gaussians.
+        Sequences, -1 for an outlier, the path's excess length and its weight, and the numbers of both Gaussians. Given
+        ones get the weight alone.
     out : ndarray of shape (n,)
-        Gets the logarithm of the component's probability.
+        Gets the logarithm of the component's probability; of a given one 0, or -inf where it would not be drawn.
     """
+    place, paths, geometry = of_map
+    factor, length_variance = measured
     offsets, sequence, _, excess, _ = paths
-    spreads, kinds, outlier = factor[3], factor[4], factor[7]
+    outlier = factor[7]
     sequences, excesses, weights, of_spread, of_kind = chosen
-    sine = 1.0 if np.isnan(factor[1]) else np.sin(factor[1])
-    peak = _highest(factor)
     error, slope = np.empty(3), np.empty((3, 3))
     scalars = np.empty(3), np.empty((3, 3)), np.empty(3)
-    trial, trial_cov = np.empty(3), np.empty((3, 3))
     density, component = np.empty(_MOST), np.empty((_MOST, 3), np.int64)
+    drawing = len(uniform) > 0
     for n in range(len(mean)):
         voxel = voxel_of(place, mean[n, 0], mean[n, 1], mean[n, 2])
         if voxel < 0 or offsets[voxel] == offsets[voxel + 1]:
             voxel = voxel_of(place, home[n, 0], home[n, 1], home[n, 2])
-        total, count = outlier, 0
-        first, last = (offsets[voxel], offsets[voxel + 1]) if voxel >= 0 else (0, 0)
-        for path in range(first, last):
-            own = _weight_of(paths, geometry, factor, path)
-            if float(paths[2][path]) * peak < _NEGLIGIBLE * total:
-                break
-            _expect(
-                mean[n],
-                np.int64(sequence[path]),
-                excess[path] if len(excess) > 0 else 0.0,
-                geometry,
-                factor[0],
-                factor[1],
-                error,
-                slope,
-            )
-            for c in range(len(spreads)):
-                for k in range(len(kinds)):
-                    if count == _MOST:
-                        continue
-                    number = _innovate(error, slope, factor, length_variance, c, k, drift, n, scalars)
-                    trial[:] = mean[n]
-                    trial_cov[:] = cov[n]
-                    log = _take_in(trial, trial_cov, number, scalars)
-                    density[count] = own * spreads[c, 0] * kinds[k, 1] * np.exp(log) / sine
-                    component[count, 0], component[count, 1], component[count, 2] = path, c, k
-                    total += density[count]
-                    count += 1
-        sequences[n], excesses[n], weights[n], of_spread[n], of_kind[n] = _OUTLIER, 0.0, 0.0, 0, 0
-        level = uniform[n] * total
-        out[n] = np.log(outlier / total)
-        for m in range(count):
-            level -= density[m]
-            if level <= 0.0:
-                path, c, k = component[m, 0], component[m, 1], component[m, 2]
-                sequences[n], of_spread[n], of_kind[n] = sequence[path], c, k
-                excesses[n] = excess[path] if len(excess) > 0 else 0.0
-                weights[n] = _weight_of(paths, geometry, factor, path)
+        path, out[n] = -1, 0.0
+        if drawing:
+            sequences[n], excesses[n], of_spread[n], of_kind[n] = _OUTLIER, 0.0, 0, 0
+            count, total = _densities(mean[n], cov[n], False, n, voxel, of_map, measured, drift, (density, component))
+            out[n] = np.log(outlier / total)
+            m = _picked(density, count, uniform[n] * total)
+            if m >= 0:
+                path, of_spread[n], of_kind[n] = component[m, 0], component[m, 1], component[m, 2]
+                sequences[n], excesses[n] = sequence[path], excess[path] if len(excess) > 0 else 0.0
                 out[n] = np.log(density[m] / total)
-                _expect(mean[n], np.int64(sequence[path]), excesses[n], geometry, factor[0], factor[1], error, slope)
-                number = _innovate(error, slope, factor, length_variance, c, k, drift, n, scalars)
-                _take_in(mean[n], cov[n], number, scalars)
-                break
+        elif sequences[n] != _OUTLIER:
+            first, last = (offsets[voxel], offsets[voxel + 1]) if voxel >= 0 else (0, 0)
+            for other in range(first, last):
+                if sequence[other] == sequences[n]:
+                    path = other
+                    break
+            if path < 0:
+                out[n] = -np.inf
+        weights[n] = _weight_of(paths, geometry, factor, path) if path >= 0 else 0.0
+        if path >= 0:
+            _expect(mean[n], np.int64(sequences[n]), excesses[n], geometry, factor, error)
+            _differentiate(mean[n], np.int64(sequences[n]), geometry, factor[0], slope)
+            number = _innovate(error, slope, factor, length_variance, of_spread[n], of_kind[n], drift, n, scalars)
+            _take_in(mean[n], cov[n], number, scalars)
 
 
 @numba.njit(cache=True, nogil=True)
-def refine(
-    mean: Any,
-    cov: Any,
-    about: Any,
-    geometry: Any,
-    factor: Any,
-    length_variance: Any,
-    drift: Any,
-    chosen: Any,
-    out: Any,
-) -> None:
+def refine(mean: Any, cov: Any, about: Any, geometry: Any, measured: Any, drift: Any, chosen: Any, out: Any) -> None:
     """Take the chosen components in anew, to first order about better positions.
 
     Parameters
@@ -296,11 +360,12 @@ def refine(
     mean, cov : ndarray of shape (n, 3) and (n, 3, 3)
         Gaussians before the observation, changed in place.
     about : ndarray of shape (n, 3), m
-    geometry, factor, length_variance, drift, chosen
+    geometry, measured, drift, chosen
         As of :func:`propose`.
     out : ndarray of shape (n,)
         Gets the log density of the observation and the component, given the Gaussian.
     """
+    factor, length_variance = measured
     spreads, kinds, outlier = factor[3], factor[4], factor[7]
     sequences, excesses, weights, of_spread, of_kind = chosen
     sine = 1.0 if np.isnan(factor[1]) else np.sin(factor[1])
@@ -311,7 +376,8 @@ def refine(
             out[n] = np.log(outlier)
             continue
         c, k = of_spread[n], of_kind[n]
-        _expect(about[n], sequences[n], excesses[n], geometry, factor[0], factor[1], error, slope)
+        _expect(about[n], sequences[n], excesses[n], geometry, factor, error)
+        _differentiate(about[n], sequences[n], geometry, factor[0], slope)
         number = _innovate(error, slope, factor, length_variance, c, k, drift, n, scalars)
         for m in range(number):
             for i in range(3):
@@ -322,84 +388,68 @@ def refine(
 
 @numba.njit(cache=True, nogil=True)
 def settle(
-    points: Any,
-    place: Any,
-    paths: Any,
-    geometry: Any,
-    factor: Any,
-    length_variance: Any,
-    drift: Any,
-    uniform: Any,
-    chosen: Any,
-    out: Any,
+    points: Any, of_map: Any, measured: Any, drift: Any, uniform: Any, given: Any, chosen: Any, out: Any
 ) -> None:
     """Evaluate an observation at positions exactly, and update the drifts.
+
+    Weights are interpolated between voxels by drawing one: by its share of the given component's weight, or, where none
+    is given, by its share alone, and then a component by its probability.
 
     Parameters
     ----------
     points : ndarray of shape (n, 3), m
-    place, paths, geometry, factor, length_variance
+    of_map, measured, chosen
         As of :func:`propose`.
     drift : tuple
         As of :func:`propose`; means and variances are changed in place.
-    uniform : ndarray of shape (n,) or (0,)
-        Random numbers by which components are drawn; empty where they are given.
-    chosen : tuple
-        As of :func:`propose`, given or filled.
-    out : ndarray of shape (n,)
-        Gets the log density of the observation and, where they are given, the component.
+    uniform : ndarray of shape (n, 2)
+        Random numbers between 0 and 1.
+    given : bool
+        Whether the components are; otherwise they are filled in.
+    out : tuple of two ndarrays of shape (n,)
+        The first gets the log density of the observation and the component; the second that of the observation, with
+        the weights of the voxel drawn.
     """
-    offsets, sequence, _, excess, _ = paths
+    place, paths, geometry = of_map
+    factor, length_variance = measured
+    sequence, excess = paths[1], paths[3]
     spreads, kinds, outlier = factor[3], factor[4], factor[7]
     sequences, excesses, _, of_spread, of_kind = chosen
+    log_component, log_all = out
     sine = 1.0 if np.isnan(factor[1]) else np.sin(factor[1])
     error, slope = np.empty(3), np.empty((3, 3))
     scalars = np.empty(3), np.empty((3, 3)), np.empty(3)
-    nowhere, exact = np.zeros(3), np.zeros((3, 3))
+    nothing = np.zeros((3, 3))
     density, component = np.empty(_MOST), np.empty((_MOST, 3), np.int64)
-    drawing = len(uniform) > 0
+    voxels, shares, weighed = np.empty(8, np.int64), np.empty(8), np.empty(8)
     for n in range(len(points)):
-        if sequences[n] == _OUTLIER and not drawing:
-            out[n] = np.log(outlier)
+        near = _around(points[n], place, paths, voxels, shares)
+        s = np.int64(sequences[n]) if given else np.int64(_OUTLIER)
+        own = _weigh(near, voxels, shares, paths, geometry, factor, s, weighed)
+        log_component[n], log_all[n] = np.log(outlier), np.log(outlier)
+        if near == 0 or own <= 0.0:
+            if s != _OUTLIER:
+                log_component[n] = -np.inf
+            elif not given:
+                sequences[n] = _OUTLIER
             continue
-        if not drawing:
+        voxel = voxels[max(_picked(weighed, near, uniform[n, 0] * own), 0)]
+        count, total = _densities(points[n], nothing, True, n, voxel, of_map, measured, drift, (density, component))
+        log_all[n] = np.log(total)
+        if not given:
+            sequences[n] = _OUTLIER
+            m = _picked(density, count, uniform[n, 1] * total)
+            if m >= 0:
+                path, of_spread[n], of_kind[n] = component[m, 0], component[m, 1], component[m, 2]
+                sequences[n], excesses[n] = sequence[path], excess[path] if len(excess) > 0 else 0.0
+                own = _weigh(near, voxels, shares, paths, geometry, factor, np.int64(sequences[n]), weighed)
+        if sequences[n] != _OUTLIER:
             c, k = of_spread[n], of_kind[n]
-            own = _weight_at(points[n], place, paths, geometry, factor, sequences[n])
-            _expect(points[n], sequences[n], excesses[n], geometry, factor[0], factor[1], error, slope)
+            _expect(points[n], np.int64(sequences[n]), excesses[n], geometry, factor, error)
             number = _innovate(error, slope, factor, length_variance, c, k, drift, n, scalars)
-            log = _take_in(nowhere, exact, number, scalars)
-            out[n] = np.log(own * spreads[c, 0] * kinds[k, 1] / sine) + log if own > 0.0 else -np.inf
+            log = _log_density(number, scalars)
+            log_component[n] = np.log(own * spreads[c, 0] * kinds[k, 1] / sine) + log
             _learn(error, factor, length_variance, c, k, drift, n)
-            continue
-        voxel = voxel_of(place, points[n, 0], points[n, 1], points[n, 2])
-        total, count = outlier, 0
-        first, last = (offsets[voxel], offsets[voxel + 1]) if voxel >= 0 else (0, 0)
-        for path in range(first, last):
-            longer = excess[path] if len(excess) > 0 else 0.0
-            own = _weight_of(paths, geometry, factor, path)
-            _expect(points[n], np.int64(sequence[path]), longer, geometry, factor[0], factor[1], error, slope)
-            for c in range(len(spreads)):
-                for k in range(len(kinds)):
-                    if count == _MOST:
-                        continue
-                    number = _innovate(error, slope, factor, length_variance, c, k, drift, n, scalars)
-                    log = _take_in(nowhere, exact, number, scalars)
-                    density[count] = own * spreads[c, 0] * kinds[k, 1] * np.exp(log) / sine
-                    component[count, 0], component[count, 1], component[count, 2] = path, c, k
-                    total += density[count]
-                    count += 1
-        level, picked = uniform[n] * total, -1
-        for m in range(count):
-            level -= density[m]
-            if level <= 0.0:
-                picked = m
-                break
-        sequences[n], out[n] = _OUTLIER, np.log(total)
-        if picked >= 0:
-            path, of_spread[n], of_kind[n] = component[picked, 0], component[picked, 1], component[picked, 2]
-            sequences[n], excesses[n] = sequence[path], excess[path] if len(excess) > 0 else 0.0
-            _expect(points[n], sequences[n], excesses[n], geometry, factor[0], factor[1], error, slope)
-            _learn(error, factor, length_variance, of_spread[n], of_kind[n], drift, n)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -29,7 +29,9 @@ class _Announcer(event.Listener):  # type: ignore[misc]
             return
         if self._last is None:
             self._begin = self._last = time.monotonic()
-            _log.warning("compiling kernels, once; this takes a minute or two and longer on a busy machine")
+            _log.warning(
+                "compiling kernels, once: a few take seconds, all a minute or two, and longer on a busy machine"
+            )
 
     def on_end(self, event: event.Event) -> None:
         """Count compilations, and log the number at intervals."""

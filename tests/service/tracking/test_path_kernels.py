@@ -37,6 +37,7 @@ class Map:
             rng.integers(0, 2, len(sequence)).astype(np.int8),
         )
         self.geometry = self.images, self.mirrors, np.array([0, 1, 2, 1, 0], np.int8)
+        self.of_map = self.place, self.paths, self.geometry
 
     def expected(self, point: Array, sequence: int, excess: float, factor: PathFactor) -> Array:
         """Azimuth and zenith in the frame of the measured angles, and length."""
@@ -91,19 +92,17 @@ def joint(cov: Array, scale: float, share: float, length: float, whole: float, v
 def test_without_drift_the_density_is_that_of_the_quadrature(zenith: bool, length: bool):
     rng = np.random.default_rng(1)
     paths, factor = Map(1), factor_of(rng, zenith=zenith, length=length)
-    points = rng.uniform(0.01, SIDE - 0.01, (200, 3))
-    found = np.empty(200)
+    points = rng.integers(0, SIDE, (200, 3)) + 0.5  # centres, where nothing is interpolated
+    one, found = np.empty(200), np.empty(200)
     settle(
         points,
-        paths.place,
-        paths.paths,
-        paths.geometry,
-        tuple(factor[:-1]),
-        0.8,
+        paths.of_map,
+        (tuple(factor[:-1]), 0.8),
         no_drift(200),
-        rng.random(200),
+        rng.random((200, 2)),
+        False,
         components(200),
-        found,
+        (one, found),
     )
     blocks = np.ravel_multi_index(tuple(np.floor(points).astype(int).T), (SIDE,) * 3)
     measured = factor.turn.T @ np.array([np.sin(factor.zenith), 0.0, np.cos(factor.zenith)])
@@ -128,7 +127,8 @@ def test_densities_and_drifts_are_those_of_a_dense_filter():
         chosen[0][n], chosen[1][n] = paths.paths[1][path], paths.paths[3][path]
         chosen[3][n], chosen[4][n] = rng.integers(2), rng.integers(2)
     drift, out = (mean.copy(), variance.copy(), np.full(count, share)), np.empty(count)
-    settle(points, paths.place, paths.paths, paths.geometry, tuple(factor[:-1]), whole, drift, np.empty(0), chosen, out)
+    measured, uniform = (tuple(factor[:-1]), whole), rng.random((count, 2))
+    settle(points, paths.of_map, measured, drift, uniform, True, chosen, (out, np.empty(count)))
     for n, point in enumerate(points):
         scale, kind = factor.spreads[chosen[3][n], 1], factor.kinds[chosen[4][n]]
         off = np.array([0.0, factor.zenith, kind[2]]) - paths.expected(
@@ -157,10 +157,10 @@ def test_a_proposal_is_a_kalman_update_about_the_prediction():
     drift = bias, variance, np.full(count, share)
     mean, cov = before.copy(), np.tile(prior, (count, 1, 1))
     chosen, log_chosen = components(count), np.empty(count)
-    arguments = paths.place, paths.paths, paths.geometry, tuple(factor[:-1]), whole, drift
-    propose(mean, cov, before, *arguments, rng.random(count), chosen, log_chosen)
+    measured = tuple(factor[:-1]), whole
+    propose(mean, cov, before, paths.of_map, measured, drift, rng.random(count), chosen, log_chosen)
     again, again_cov, log_again = before.copy(), np.tile(prior, (count, 1, 1)), np.empty(count)
-    refine(again, again_cov, before, paths.geometry, tuple(factor[:-1]), whole, drift, chosen, log_again)
+    refine(again, again_cov, before, paths.geometry, measured, drift, chosen, log_again)
     taken = chosen[0] >= 0
     assert taken.mean() > 0.3
     np.testing.assert_allclose(again, mean, atol=1e-9)
@@ -199,3 +199,72 @@ def test_a_proposal_is_a_kalman_update_about_the_prediction():
                         np.testing.assert_allclose(cov[n], prior - gain @ rows @ prior, atol=1e-6)
         assert log_chosen[n] == pytest.approx(np.log(own / total), abs=1e-3)
         assert log_again[n] == pytest.approx(np.log(own), abs=1e-6)
+
+
+def test_weights_are_interpolated_by_drawing_a_voxel():
+    """The mean over all random numbers is the interpolation: the eight voxels' densities by their shares."""
+    rng = np.random.default_rng(4)
+    paths, factor = Map(4), factor_of(rng)
+    count, centres = 20_000, np.arange(SIDE) + 0.5
+    level = np.column_stack([(np.arange(count) + 0.5) / count, rng.random(count)])
+    for point in rng.uniform(0.5, SIDE - 0.5, (5, 3)):
+        one, found = np.empty(count), np.empty(count)
+        chosen = components(count)
+        points, measured = np.tile(point, (count, 1)), (tuple(factor[:-1]), 0.8)
+        settle(points, paths.of_map, measured, no_drift(count), level, False, chosen, (one, found))
+        grid = np.empty(SIDE**3)
+        for voxel in range(SIDE**3):
+            of_voxel = paths.paths[1:4]
+            grid[voxel] = factor.outlier
+            for path in range(voxel * NUM_PATHS, (voxel + 1) * NUM_PATHS):
+                sequence, weight, excess = (column[path] for column in of_voxel)
+                direct = paths.geometry[2][sequence] == 0 and paths.paths[4][path] == 0
+                own = float(weight) * (factor.direct if direct else factor.reflected) / np.sin(factor.zenith)
+                at = paths.expected(point, int(sequence), float(excess), factor)
+                for part, scale in factor.spreads:
+                    for kind in factor.kinds:
+                        number = 3 if np.isfinite(kind[3]) else 2
+                        off = np.array([0.0, factor.zenith, kind[2]]) - at
+                        off[0] = np.angle(np.exp(1j * off[0]))
+                        noise = joint(factor.cov, scale, 0.0, kind[3] if number == 3 else 1.0, 0.8, np.zeros(3))
+                        density = multivariate_normal(np.zeros(number), noise[:number, :number]).pdf(off[:number])
+                        grid[voxel] += own * part * kind[1] * density
+        expected = float(RegularGridInterpolator((centres,) * 3, grid.reshape((SIDE,) * 3))(point)[0])
+        assert np.exp(found).mean() == pytest.approx(expected, rel=2e-3)
+
+
+def test_a_component_drawn_at_a_place_has_the_density_of_the_same_one_given():
+    rng = np.random.default_rng(5)
+    paths, factor, count = Map(5), factor_of(rng), 400
+    points, measured = rng.uniform(0.01, SIDE - 0.01, (count, 3)), (tuple(factor[:-1]), 0.8)
+    chosen, drawn, given, both = components(count), np.empty(count), np.empty(count), np.empty((2, count))
+    uniform = rng.random((count, 2))
+    settle(points, paths.of_map, measured, no_drift(count), uniform, False, chosen, (drawn, both[0]))
+    assert 0.3 < (chosen[0] >= 0).mean() < 1.0
+    settle(points, paths.of_map, measured, no_drift(count), uniform, True, chosen, (given, both[1]))
+    np.testing.assert_allclose(given, drawn, rtol=1e-12)
+    nowhere = np.full((1, 3), SIDE + 2.0)
+    settle(nowhere, paths.of_map, measured, no_drift(1), uniform[:1], True, chosen, (given, both[0]))
+    assert given[0] == (-np.inf if chosen[0][0] >= 0 else np.log(factor.outlier))
+    assert both[0, 0] == np.log(factor.outlier)
+
+
+def test_given_components_are_taken_in_where_they_could_have_been_drawn():
+    rng = np.random.default_rng(6)
+    paths, factor, count = Map(6), factor_of(rng), 200
+    before, prior = rng.uniform(0.2, SIDE - 0.2, (count, 3)), np.tile(0.05 * np.eye(3), (count, 1, 1))
+    measured, chosen, out = (tuple(factor[:-1]), 0.8), components(count), np.empty(count)
+    mean, cov = before.copy(), prior.copy()
+    propose(mean, cov, before, paths.of_map, measured, no_drift(count), rng.random(count), chosen, out)
+    again, again_cov = before.copy(), prior.copy()
+    propose(again, again_cov, before, paths.of_map, measured, no_drift(count), np.empty(0), chosen, out)
+    np.testing.assert_array_equal(out, 0.0)
+    np.testing.assert_allclose(again, mean, atol=1e-12)
+    np.testing.assert_allclose(again_cov, cov, atol=1e-12)
+    voxel = np.ravel_multi_index(tuple(np.floor(before).astype(int).T), (SIDE,) * 3)
+    there = paths.paths[1].reshape(-1, NUM_PATHS)[voxel]
+    chosen[0][:] = rng.integers(-1, 5, count)
+    again, again_cov = before.copy(), prior.copy()
+    propose(again, again_cov, before, paths.of_map, measured, no_drift(count), np.empty(0), chosen, out)
+    possible = (chosen[0] < 0) | (there == chosen[0][:, None]).any(axis=1)
+    np.testing.assert_array_equal(out, np.where(possible, 0.0, -np.inf))
