@@ -36,8 +36,12 @@ from rayfix_tables.gaussians.definite import cholesky_factors
 _ROUNDS = 8
 """Times that positions are drawn at most."""
 
-_ENOUGH = 0.5
-"""Effective number of them, in particles, at which it ends."""
+_ENOUGH = 1.0
+"""Effective number of them, in particles, at which it ends.
+
+Half of the draws have little weight where drifts are known well; with 0.5, what few particles know of them was lost
+sooner at ten reports a second.
+"""
 
 Array = NDArray[np.float64]
 DriftOf = tuple[Array, Array, Array]
