@@ -41,6 +41,12 @@ from rayfix_tables.paths import COMPACT_SEQUENCE, COMPACT_WEIGHT, GAIN_FIELDS, P
 from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
 
+_WIDEST_WINDOW = 2.0 * math.pi
+"""Of compact components, rad: their angles are numbers of windows, and must not overflow."""
+
+_LARGEST_UNIT = 2.0**15
+"""Of weights: times the largest number of half precision, it is far from the largest of single precision."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
@@ -253,7 +259,10 @@ def _check_absent(layout: FileLayout, group: str, names: Iterable[str]) -> None:
 
 def _window(path: str, layout: FileLayout, *, compact: bool) -> float:
     if compact:
-        return _positive(layout.attributes[path]["window_rad"], f"window_rad of {path}")
+        window = _positive(layout.attributes[path]["window_rad"], f"window_rad of {path}")
+        if window > _WIDEST_WINDOW:
+            raise ValueError(f"window_rad of {path} is {window}")
+        return window
     return float(np.deg2rad(_positive(layout.attributes[path]["window_deg"], f"window_deg of {path}")))
 
 
@@ -348,6 +357,8 @@ def _read_paths(
         for name, (dtype, _) in PATH_DATASETS.items()
     }
     weight_unit = _positive(attributes["weight_unit"], f"weight_unit of {group}") if compact else 1.0
+    if weight_unit > _LARGEST_UNIT:
+        raise ValueError(f"weight_unit of {group} is {weight_unit}")
     voxel_size = _positive(attributes["voxel_size_m"], f"voxel_size_m of {group}")
     refinement = max(1, round(voxel_size / free_space.voxel_size))
     shape = tuple((-(-np.array(free_space.free.shape) // refinement)).tolist())

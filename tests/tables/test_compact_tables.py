@@ -187,8 +187,8 @@ def test_what_is_missing_or_of_another_shape_is_refused(compact_path: Path, name
         Table.open(compact_path)
 
 
-@pytest.mark.parametrize("unit", [0.0, -1.0])
-def test_units_that_are_not_positive_are_refused(compact_path: Path, unit: float) -> None:
+@pytest.mark.parametrize("unit", [0.0, -1.0, np.nan, 1e300])
+def test_units_out_of_range_are_refused(compact_path: Path, unit: float) -> None:
     for group, name in ((LEVEL, "window_rad"), (PATHS, "weight_unit")):
         with h5py.File(compact_path, "r+") as file:
             before = file[group].attrs[name]
