@@ -71,7 +71,9 @@ class Level:
     @property
     def expanded(self) -> "Level":
         """The level with all components in double precision, if they are compact."""
-        return replace(self, mixture=self.mixture.expanded) if isinstance(self.mixture, CompactTubes) else self
+        if not isinstance(self.mixture, CompactTubes):
+            return self
+        return replace(self, mixture=self.mixture.expanded, log_balance=self.log_balance.astype(np.float32))
 
     def ranges(self, most: int) -> Iterator[tuple[int, int]]:
         """Split the cells into ranges (first, stop) of at most ``most`` components, or of one cell."""

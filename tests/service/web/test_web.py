@@ -121,7 +121,7 @@ def test_the_level_follows_the_deviation(table: Table):
 
 
 def test_a_direction_without_rays_is_empty(table: Table):
-    level = table.parts["bs1"].levels[0]
+    level = table.parts["bs1"].levels[0].expanded
     bare = replace(
         level,
         cell_offsets=np.zeros_like(level.cell_offsets),

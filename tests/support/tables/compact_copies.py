@@ -18,11 +18,6 @@ def compact_level(level: Level) -> Level:
     return replace(level, mixture=mixture, log_balance=level.log_balance.astype(np.float16))
 
 
-def whole_level(level: Level) -> Level:
-    """Return the numbers of a compact level in double precision, as kernels of former versions read them."""
-    return replace(level.expanded, log_balance=level.log_balance.astype(np.float32))
-
-
 def compact_copy(table: Table, path: Path) -> Table:
     """Write a compact copy of a table to a path and open it."""
     parts = [
@@ -43,7 +38,7 @@ def former_copy(table: Table, path: Path) -> Table:
         paths = part.paths
         if paths is not None:
             paths = replace(paths, weight=paths.weight_of_1, weight_unit=1.0, sequence=paths.sequence.astype(np.int32))
-        parts.append(replace(part, levels=tuple(whole_level(level) for level in part.levels), paths=paths))
+        parts.append(replace(part, levels=tuple(level.expanded for level in part.levels), paths=paths))
     return _written(table, parts, path)
 
 

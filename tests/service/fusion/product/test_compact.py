@@ -12,7 +12,7 @@ from rayfix_service.fusion.product.station_mixture import StationMixtures
 from rayfix_service.locator import Locator
 from rayfix_tables.part import StationPart
 from tests.support.messages.hand_reports import EXACT, TUBES, differences, measured, report_of
-from tests.support.tables.compact_copies import compact_copy, whole_level
+from tests.support.tables.compact_copies import compact_copy
 from tests.support.tables.hand_tables import table_of
 from tests.support.tables.random_tables import compact_content
 
@@ -25,7 +25,7 @@ def parts(seed: int) -> tuple[StationPart, StationPart]:
     """Make a station's compact part, balanced at the finer level, and the same in double precision."""
     part = compact_content(seed, num_stations=1, max_components=5).parts[0]
     assert len(part.levels[0].log_balance) > 0
-    return part, replace(part, levels=tuple(whole_level(level) for level in part.levels))
+    return part, replace(part, levels=tuple(level.expanded for level in part.levels))
 
 
 @pytest.mark.parametrize("seed", range(5))
