@@ -53,7 +53,7 @@ square. In the bundled hall, balancing and maps of paths included:
 |---|---|---|
 {measured}
 
-So the coarse windows cost about a quarter of the default's time and size. Of each size, 53 MB are the stations' maps of paths, which
+So the coarse windows cost about a quarter of the default's time and size. Of each size, 36 MB are the stations' maps of paths, which
 depend on no window ([of what a table's size is made](performance.md#the-whole-build)). All deviations up to the finest window
 divided by 1.25 are served by it; where they are far below it, edges of what a station sees are less sharp than they could be.
 """
@@ -83,10 +83,12 @@ the code: `make reference`.
 """
 
 WINDOWS_MEASURED = """\
-| `[1.25, 5, 15]` | 86 s | 294 MB |
-| `[2.5, 10]` | 37 s | 126 MB |
-| `[5, 15]` | 22 s | 81 MB |"""
-"""By builds of `rayfix example` with these windows, one job and kernels that were compiled before, on busy cores."""
+| `[1.25, 5, 15]` | 86 s | 175 MB |
+| `[2.5, 10]` | 37 s | 78 MB |
+| `[5, 15]` | 22 s | 52 MB |"""
+"""By builds of `rayfix example` with these windows, one job and kernels that were compiled before, on busy cores.
+
+Sizes of the second and the third are those of their components and paths, of 67 and 8 bytes."""
 
 
 def site_page() -> str:

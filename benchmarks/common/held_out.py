@@ -10,13 +10,14 @@ from rayfix_offline.rays.settings import RaySettings
 from rayfix_offline.rays.trace import LevelRays, trace_station
 from rayfix_offline.site import SiteFile
 from rayfix_offline.twin.twin import Twin
-from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES, TubeMixture, joint_cov, unpack
+from rayfix_tables.compact.tubes import COMPACT_FIELDS
+from rayfix_tables.mixture import TubeMixture, joint_cov, unpack
 
 REFERENCE_RATIO = 1.1
 """Slices of the rays that held-out points are drawn from: finer than those of any fit."""
 
 COMPONENT_BYTES = sum(
-    int(np.prod(shape, dtype=int)) * np.dtype(FIELD_DTYPES[name]).itemsize for name, shape in FIELD_SHAPES.items()
+    int(np.prod(shape, dtype=int)) * np.dtype(dtype).itemsize for dtype, shape in COMPACT_FIELDS.values()
 )
 
 

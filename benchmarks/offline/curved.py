@@ -25,6 +25,7 @@ from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.rays.trace import LevelRays, trace_station
 from rayfix_offline.site import SiteFile, parse_site
 from rayfix_offline.twin.twin import Twin, prepare_twin
+from rayfix_tables.compact.tubes import compacted
 from rayfix_tables.geometry.angles import wrap
 
 STATION = (0.3, 0.4, 2.6)
@@ -142,10 +143,10 @@ def measure(level: LevelRays, cells: NDArray[np.int64], points: list[NDArray[np.
     begin = time.process_time()
     counts, _, mixture, _ = fit_tubes(centres, level, fit)
     seconds = time.process_time() - begin
-    ends = np.cumsum(counts)
+    ends, stored = np.cumsum(counts), compacted(mixture, level.window)
     scores = np.array(
         [
-            [density.mean() for density in log_densities(mixture[int(end - count) : int(end)], mine)]
+            [density.mean() for density in log_densities(stored[int(end - count) : int(end)], mine)]
             for end, count, mine in zip(ends, counts, points, strict=True)
         ]
     )

@@ -28,6 +28,7 @@ from rayfix_offline.job.plan import BLOCK_CELLS
 from rayfix_offline.rays.trace import LevelRays, level_grid
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin.twin import Twin, prepare_twin
+from rayfix_tables.compact.tubes import compacted
 
 HELD_OUT_POINTS = 1000
 
@@ -149,10 +150,10 @@ def score_block(setting: Setting, level: LevelRays, held_out: dict[Cell, NDArray
         begin = time.thread_time()
         counts, _, mixture, _ = fit_em(centres, numbers, level, fit)
         seconds = (time.thread_time() - begin) / len(numbers)
-    ends = np.cumsum(counts)
+    ends, stored = np.cumsum(counts), compacted(mixture, level.window)
     scores = []
     for (cell, points), count, end in zip(held_out.items(), counts, ends, strict=True):
-        joint, position = log_densities(mixture[int(end - count) : int(end)], points)
+        joint, position = log_densities(stored[int(end - count) : int(end)], points)
         scores.append(
             Score(
                 setting=setting.name,

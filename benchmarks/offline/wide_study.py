@@ -36,7 +36,8 @@ from rayfix_offline.rays.trace import LevelRays, level_grid
 from rayfix_offline.site import SiteFile, read_site
 from rayfix_offline.twin.twin import prepare_twin
 from rayfix_service.locator import Locator
-from rayfix_tables.level import WINDOW_RATIO, Level
+from rayfix_tables.compact.tubes import compacted
+from rayfix_tables.level import COMPACT_UNBALANCED, WINDOW_RATIO, Level
 from rayfix_tables.mixture import TubeMixture
 from rayfix_tables.table import Table
 
@@ -149,7 +150,8 @@ def summed_levels(finest: Level, site: SiteFile, fit: CoarseFit) -> tuple[tuple[
                 grid=grid,
                 cell_offsets=np.concatenate([[0], np.cumsum(summed.counts)]),
                 cell_log_mass=summed.log_mass,
-                mixture=summed.mixture,
+                mixture=compacted(summed.mixture, window),
+                log_balance=COMPACT_UNBALANCED,
             )
         )
     return tuple(levels), seconds
@@ -169,7 +171,8 @@ def direct_levels(finest: Level, direct: list[LevelRays]) -> tuple[tuple[Level, 
                 grid=rays.grid,
                 cell_offsets=np.concatenate([[0], np.cumsum(counts)]),
                 cell_log_mass=log_mass,
-                mixture=mixture,
+                mixture=compacted(mixture, rays.window),
+                log_balance=COMPACT_UNBALANCED,
             )
         )
     return tuple(levels), seconds
@@ -183,8 +186,8 @@ def choose_cells(rays: LevelRays, count: int, rng: np.random.Generator) -> NDArr
 def fitted_by_em(rays: LevelRays, cells: NDArray[np.int64]) -> Fitted:
     """Fit cells by em to rays at the wide window."""
     begin = time.thread_time()
-    counts, _, mixture, _ = fit_em(rays.grid.centres[cells], cells, rays, ExpectationMaximisation(num_components=(16,)))
-    ends = np.cumsum(counts)
+    counts, _, fitted, _ = fit_em(rays.grid.centres[cells], cells, rays, ExpectationMaximisation(num_components=(16,)))
+    ends, mixture = np.cumsum(counts), compacted(fitted, rays.window)
     return Fitted(
         cells=[mixture[int(end - count) : int(end)] for count, end in zip(counts, ends, strict=True)],
         seconds=(time.thread_time() - begin) / len(cells),

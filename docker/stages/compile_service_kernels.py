@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_service.http.answering.served_tables import load_table
+from rayfix_tables.compact.tubes import compacted
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.geometry.angles import direction
 from rayfix_tables.grid import AngularGrid
-from rayfix_tables.level import Level
+from rayfix_tables.level import COMPACT_UNBALANCED, UNBALANCED, Level
 from rayfix_tables.mixture import TubeMixture, pack
 from rayfix_tables.part import StationPart
 from rayfix_tables.scene import Scene
@@ -29,12 +30,14 @@ LENGTHS = np.array([1.0, 2.0, 3.5, 5.5])
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "room.h5"
-        write_room(path)
-        load_table("room", path)
+        # Kernels for tables of the present format, and of those without compact components.
+        for name, compact in (("room", True), ("former", False)):
+            path = Path(folder) / f"{name}.h5"
+            write_room(path, compact=compact)
+            load_table(name, path)
 
 
-def write_room(path: Path) -> None:
+def write_room(path: Path, *, compact: bool = True) -> None:
     """Write the table of a room whose stations hear the direct path alone."""
     stations = (
         Station(id="a", position=(0.1, 0.1, 2.4)),
@@ -53,26 +56,33 @@ def write_room(path: Path) -> None:
             sha256="0" * 64,
         ),
         parts=[
-            StationPart(station=station, levels=levels(np.array(station.position)), lost_ray_share=0.0, coverage=(1.0,))
+            StationPart(
+                station=station,
+                levels=levels(np.array(station.position), compact=compact),
+                lost_ray_share=0.0,
+                coverage=(1.0,),
+            )
             for station in stations
         ],
         software_version=software_version(),
     )
 
 
-def levels(position: NDArray[np.float64]) -> tuple[Level, ...]:
+def levels(position: NDArray[np.float64], *, compact: bool) -> tuple[Level, ...]:
     """Levels of a station: in each cell, pieces of the straight path of several lengths."""
     made = []
     for window in WINDOWS:
         grid = AngularGrid.from_spacing(window / 0.8)
         num_cells, num_pieces = grid.num_cells, len(LENGTHS)
+        mixture = pieces(position, grid.centres, float(window))
         made.append(
             Level(
                 window=float(window),
                 grid=grid,
                 cell_offsets=np.arange(num_cells + 1) * num_pieces,
                 cell_log_mass=np.zeros(num_cells),
-                mixture=pieces(position, grid.centres, float(window)),
+                mixture=compacted(mixture, float(window)) if compact else mixture,
+                log_balance=COMPACT_UNBALANCED if compact else UNBALANCED,
             )
         )
     return tuple(made)

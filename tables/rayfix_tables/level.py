@@ -1,14 +1,15 @@
 """A level: all cells of one station at one window."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_tables.compact.tubes import CompactTubes
 from rayfix_tables.grid import AngularGrid
-from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+from rayfix_tables.mixture import TubeMixture
 
 WINDOW_RATIO = 1.25
 """A window's standard deviation is at least this times that of the measurements that it is used for."""
@@ -19,6 +20,10 @@ WIDE_RATIO = 1.28
 UNBALANCED: NDArray[np.float32] = np.zeros(0, np.float32)
 """``log_balance`` of a level without one; read-only, like the mapped arrays that kernels are compiled for."""
 UNBALANCED.flags.writeable = False
+
+COMPACT_UNBALANCED: NDArray[np.float16] = np.zeros(0, np.float16)
+"""The same of a level of compact components."""
+COMPACT_UNBALANCED.flags.writeable = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,9 +38,10 @@ class Level:
         Components of cell ``c`` are those from ``cell_offsets[c]`` to ``cell_offsets[c + 1]``.
     cell_log_mass : ndarray of shape (n_cells,)
         Natural logarithm of the integral of the cell's measure; -inf for a cell without components.
-    mixture : TubeMixture
-        Components of all cells.
-    log_balance : ndarray of shape (n_components,) or (0,)
+    mixture : TubeMixture or CompactTubes
+        Components of all cells, as the file has them: compact since version 5 of the format. Either is read in the same
+        way; what a compact one is asked for is expanded, so that only few components should be asked for at a time.
+    log_balance : ndarray of shape (n_components,) or (0,), float32, of compact components float16
         Added to the components' ``log_weight`` when positions are compared. The probabilities of the paths to each
         position then add up to 1, as closely as Gaussians permit. Empty if the level is not balanced.
     """
@@ -44,7 +50,7 @@ class Level:
     grid: AngularGrid
     cell_offsets: NDArray[np.int64]
     cell_log_mass: NDArray[np.float64]
-    mixture: TubeMixture
+    mixture: TubeMixture | CompactTubes
     log_balance: NDArray[Any] = field(default_factory=lambda: UNBALANCED)
 
     @property
@@ -56,6 +62,18 @@ class Level:
     def num_components(self) -> int:
         """Number of components over all cells."""
         return len(self.mixture)
+
+    @property
+    def is_compact(self) -> bool:
+        """Whether the components are compact."""
+        return isinstance(self.mixture, CompactTubes)
+
+    @property
+    def expanded(self) -> "Level":
+        """The level with all components in double precision, if they are compact."""
+        if not isinstance(self.mixture, CompactTubes):
+            return self
+        return replace(self, mixture=self.mixture.expanded, log_balance=self.log_balance.astype(np.float32))
 
     def ranges(self, most: int) -> Iterator[tuple[int, int]]:
         """Split the cells into ranges (first, stop) of at most ``most`` components, or of one cell."""
@@ -75,5 +93,4 @@ class Level:
     def num_bytes(self) -> int:
         """Size of the level's arrays in the file."""
         arrays = [self.grid.ring_cells, self.cell_offsets, self.cell_log_mass, self.log_balance]
-        arrays += [getattr(self.mixture, name) for name in FIELD_SHAPES]
-        return sum(array.nbytes for array in arrays)
+        return sum(array.nbytes for array in arrays) + self.mixture.num_bytes

@@ -127,7 +127,12 @@ class TubeMixture:
         """Arrays that kernels take."""
         return Tubes(self.log_weight, self.u_mean, self.u_cov, self.x_mean, self.jacobian, self.x_cov)
 
-    def __getitem__(self, index: slice | NDArray[np.int64]) -> "TubeMixture":
+    @property
+    def num_bytes(self) -> int:
+        """Size of the arrays."""
+        return sum(getattr(self, name).nbytes for name in FIELD_SHAPES)
+
+    def __getitem__(self, index: slice | NDArray[Any]) -> "TubeMixture":
         """Components of a slice, without a copy, or of an index array."""
         return TubeMixture(**{name: getattr(self, name)[index] for name in FIELD_SHAPES})
 

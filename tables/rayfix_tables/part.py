@@ -80,6 +80,11 @@ class StationPart:
     paths: PathMap | None = None
 
     @property
+    def is_compact(self) -> bool:
+        """Whether components and paths are compact, as since version 5 of the format."""
+        return all(level.is_compact for level in self.levels) and (self.paths is None or self.paths.is_compact)
+
+    @property
     def num_bytes(self) -> int:
         """Size of the part's arrays in the file."""
         return sum(level.num_bytes for level in self.levels) + (self.paths.num_bytes if self.paths else 0)

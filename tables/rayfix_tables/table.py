@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,10 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_tables.compact.tubes import COMPACT_FIELDS, CompactTubes
 from rayfix_tables.disk.calibrated import read_calibration
 from rayfix_tables.disk.files import open_table_file
 from rayfix_tables.disk.layout import FileLayout, damage_reported, read_layout
 from rayfix_tables.disk.schema import (
+    COMPACT_LEVEL_DATASETS,
+    COMPACT_PATH_DATASETS,
+    FORMAT_VERSION,
     LEVEL_DATASETS,
     PATH_DATASETS,
     SCENE_DATASETS,
@@ -30,12 +34,18 @@ from rayfix_tables.disk.selected import read_selection
 from rayfix_tables.disk.values import check_finite, check_offsets, check_range, check_rings
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
-from rayfix_tables.level import UNBALANCED, Level
+from rayfix_tables.level import COMPACT_UNBALANCED, UNBALANCED, Level
 from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 from rayfix_tables.part import StationPart, Update
-from rayfix_tables.paths import GAIN_FIELDS, PathMap
+from rayfix_tables.paths import COMPACT_SEQUENCE, COMPACT_WEIGHT, GAIN_FIELDS, PathMap
 from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
+
+_WIDEST_WINDOW = 2.0 * math.pi
+"""Of compact components, rad: their angles are numbers of windows, and must not overflow."""
+
+_LARGEST_UNIT = 2.0**15
+"""Of weights: times the largest number of half precision, it is far from the largest of single precision."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +111,7 @@ class Table:
             When a part is missing or inconsistent with others.
         """
         root = layout.attributes[""]
+        version = int(_finite(root["format_version"]))
         site_document = _read_json(layout, mapped, "site")
         if not isinstance(site_document, dict):
             raise ValueError("site is not a JSON object")
@@ -122,7 +133,8 @@ class Table:
                 deviations=deviations,
                 selection=read_selection(attributes),
             ).moved(scene.origin)
-            levels = tuple(_read_level(path, layout, mapped) for path in _level_paths(layout, station_id))
+            read = _read_compact_level if version >= FORMAT_VERSION else _read_level
+            levels = tuple(read(path, layout, mapped) for path in _level_paths(layout, station_id))
             stations.append(station)
             parts[station_id] = StationPart(
                 station=station,
@@ -133,12 +145,12 @@ class Table:
                 cut_power_share=_finite(attributes.get("cut_power_share", 0.0)),
                 part_id=_text(attributes["part_id"]),
                 update=_read_update(station_id, layout, levels, mapped),
-                paths=_read_paths(station_id, layout, mapped, scene.free_space),
+                paths=_read_paths(station_id, layout, mapped, scene.free_space, compact=version >= FORMAT_VERSION),
             )
         return cls(
             path=path,
             table_id=_text(root["table_id"]),
-            format_version=int(_finite(root["format_version"])),
+            format_version=version,
             software_version=_text(root["software_version"]),
             site=SiteInfo(
                 name=_text(site_document["name"]),
@@ -221,30 +233,83 @@ def _level_paths(layout: FileLayout, station_id: str) -> list[str]:
 
 
 def _read_level(path: str, layout: FileLayout, mapped: NDArray[np.uint8]) -> Level:
-    arrays = {name: layout.array(f"{path}/{name}", mapped) for name in LEVEL_DATASETS}
+    """Read a level of a version without compact components."""
+    _check_absent(layout, path, (*(COMPACT_LEVEL_DATASETS.keys() - LEVEL_DATASETS.keys()), "log_balance16"))
+    arrays, grid = _level_arrays(path, layout, mapped, LEVEL_DATASETS, FIELD_SHAPES)
+    mixture = TubeMixture(**{name: arrays[name] for name in FIELD_SHAPES})
+    return _level(path, layout, mapped, arrays, grid, mixture)
+
+
+def _read_compact_level(path: str, layout: FileLayout, mapped: NDArray[np.uint8]) -> Level:
+    """Read a level of compact components."""
+    _check_absent(layout, path, (*(LEVEL_DATASETS.keys() - COMPACT_LEVEL_DATASETS.keys()), "log_balance"))
+    shapes = {name: shape for name, (_, shape) in COMPACT_FIELDS.items()}
+    arrays, grid = _level_arrays(path, layout, mapped, COMPACT_LEVEL_DATASETS, shapes)
+    window = _window(path, layout, compact=True)
+    mixture = CompactTubes(window=window, **{name: arrays[name] for name in COMPACT_FIELDS})
+    return _level(path, layout, mapped, arrays, grid, mixture)
+
+
+def _check_absent(layout: FileLayout, group: str, names: Iterable[str]) -> None:
+    """Check that a group has no dataset of another version of the format."""
+    for name in names:
+        if f"{group}/{name}" in layout.datasets:
+            raise ValueError(f"{group}/{name} does not belong to a table of this format version")
+
+
+def _window(path: str, layout: FileLayout, *, compact: bool) -> float:
+    if compact:
+        window = _positive(layout.attributes[path]["window_rad"], f"window_rad of {path}")
+        if window > _WIDEST_WINDOW:
+            raise ValueError(f"window_rad of {path} is {window}")
+        return window
+    return float(np.deg2rad(_positive(layout.attributes[path]["window_deg"], f"window_deg of {path}")))
+
+
+def _level_arrays(
+    path: str,
+    layout: FileLayout,
+    mapped: NDArray[np.uint8],
+    datasets: Iterable[str],
+    component_shapes: Mapping[str, tuple[int, ...]],
+) -> tuple[dict[str, NDArray[Any]], AngularGrid]:
+    """Read the datasets of a level, with the shapes that they should have, and its grid."""
+    arrays = {name: layout.array(f"{path}/{name}", mapped) for name in datasets}
     offsets = arrays["cell_offsets"]
     check_rings(f"{path}/ring_cells", arrays["ring_cells"], len(offsets) - 1)
     grid = AngularGrid(ring_cells=np.array(arrays["ring_cells"]))
-    length = len(arrays["log_weight"])
+    length = len(arrays["x_mean"])
     has_walls = f"{path}/num_walls" in layout.datasets
     arrays["num_walls"] = (
         layout.array(f"{path}/num_walls", mapped) if has_walls else np.broadcast_to(np.int8(0), length)
     )
-    mixture = TubeMixture(**{name: arrays[name] for name in FIELD_SHAPES})
-    shapes = {name: (len(mixture), *shape) for name, shape in FIELD_SHAPES.items()}
+    shapes = {name: (length, *shape) for name, shape in component_shapes.items()}
     shapes |= {"cell_offsets": (grid.num_cells + 1,), "cell_log_mass": (grid.num_cells,)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{path}/{name} has the shape {arrays[name].shape}, not {shape}")
-    balanced = f"{path}/log_balance" in layout.datasets
-    log_balance = layout.array(f"{path}/log_balance", mapped) if balanced else UNBALANCED
+    check_offsets(f"{path}/cell_offsets", offsets, length)
+    return arrays, grid
+
+
+def _level(
+    path: str,
+    layout: FileLayout,
+    mapped: NDArray[np.uint8],
+    arrays: Mapping[str, NDArray[Any]],
+    grid: AngularGrid,
+    mixture: TubeMixture | CompactTubes,
+) -> Level:
+    compact = isinstance(mixture, CompactTubes)
+    name = f"{path}/log_balance16" if compact else f"{path}/log_balance"
+    unbalanced = COMPACT_UNBALANCED if compact else UNBALANCED
+    log_balance = layout.array(name, mapped) if name in layout.datasets else unbalanced
     if len(log_balance) not in (0, len(mixture)):
-        raise ValueError(f"{path}/log_balance has {len(log_balance)} entries, not {len(mixture)}")
-    check_offsets(f"{path}/cell_offsets", offsets, len(mixture))
+        raise ValueError(f"{name} has {len(log_balance)} entries, not {len(mixture)}")
     return Level(
-        window=float(np.deg2rad(_positive(layout.attributes[path]["window_deg"], f"window_deg of {path}"))),
+        window=_window(path, layout, compact=compact),
         grid=grid,
-        cell_offsets=offsets,
+        cell_offsets=arrays["cell_offsets"],
         cell_log_mass=arrays["cell_log_mass"],
         mixture=mixture,
         log_balance=log_balance,
@@ -273,18 +338,27 @@ def _read_update(
 
 
 def _read_paths(
-    station_id: str, layout: FileLayout, mapped: NDArray[np.uint8], free_space: FreeSpace
+    station_id: str, layout: FileLayout, mapped: NDArray[np.uint8], free_space: FreeSpace, *, compact: bool
 ) -> PathMap | None:
     group = paths_path(station_id)
     if group not in layout.attributes:
         return None
     attributes = layout.attributes[group]
+    names = {name: name for name in PATH_DATASETS}
+    if compact:
+        names["weight"] = COMPACT_WEIGHT
+        if f"{group}/{COMPACT_SEQUENCE}" in layout.datasets:
+            names["sequence"] = COMPACT_SEQUENCE
+    _check_absent(layout, group, (PATH_DATASETS.keys() | COMPACT_PATH_DATASETS.keys()) - set(names.values()))
     arrays = {
         name: np.zeros(0, dtype)
         if name in GAIN_FIELDS and f"{group}/{name}" not in layout.datasets
-        else layout.array(f"{group}/{name}", mapped)
+        else layout.array(f"{group}/{names[name]}", mapped)
         for name, (dtype, _) in PATH_DATASETS.items()
     }
+    weight_unit = _positive(attributes["weight_unit"], f"weight_unit of {group}") if compact else 1.0
+    if weight_unit > _LARGEST_UNIT:
+        raise ValueError(f"weight_unit of {group} is {weight_unit}")
     voxel_size = _positive(attributes["voxel_size_m"], f"voxel_size_m of {group}")
     refinement = max(1, round(voxel_size / free_space.voxel_size))
     shape = tuple((-(-np.array(free_space.free.shape) // refinement)).tolist())
@@ -304,13 +378,14 @@ def _read_paths(
     }
     for name, expected in shapes.items():
         if arrays[name].shape != expected:
-            raise ValueError(f"{group}/{name} has the shape {arrays[name].shape}, not {expected}")
+            raise ValueError(f"{group}/{names[name]} has the shape {arrays[name].shape}, not {expected}")
     check_offsets(f"{group}/offsets", arrays["offsets"], count)
-    check_range(f"{group}/sequence", arrays["sequence"], 0, num_sequences - 1)
+    check_range(f"{group}/{names['sequence']}", arrays["sequence"], 0, num_sequences - 1)
     return PathMap(
         origin=np.array(_triple(attributes["origin_m"])),
         voxel_size=voxel_size,
         shape=shape,
+        weight_unit=weight_unit,
         **arrays,
     )
 

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_tables.compact.tubes import COMPACT_FIELDS
 from rayfix_tables.disk.calibrated import CALIBRATION, calibration_text
 from rayfix_tables.disk.files import has_signature, why_not_regular
 from rayfix_tables.disk.ownership import own_file, remove_abandoned, try_lock
@@ -20,6 +21,7 @@ from rayfix_tables.disk.schema import (
     FORMAT,
     FORMAT_VERSION,
     PATH_DATASETS,
+    WHOLE_VERSION,
     array_digest,
     bias_attributes,
     content_attributes,
@@ -33,9 +35,9 @@ from rayfix_tables.disk.schema import (
 from rayfix_tables.disk.selected import SELECTION, selection_text
 from rayfix_tables.errors import RayfixError, TableError
 from rayfix_tables.level import Level
-from rayfix_tables.mixture import FIELD_SHAPES
+from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
 from rayfix_tables.part import StationPart, Update
-from rayfix_tables.paths import PathMap
+from rayfix_tables.paths import COMPACT_SEQUENCE, COMPACT_WEIGHT, PathMap
 from rayfix_tables.scene import Scene
 from rayfix_tables.site import SiteInfo, Station
 
@@ -108,6 +110,8 @@ def write_table(
 ) -> str:
     """Write a table file and return its ``table_id``.
 
+    It has version 5 of the format where components and path maps are compact, and version 4 where none is.
+
     ``path`` is replaced only when the whole table is on disk; a former file there remains until then.
 
     Parameters
@@ -120,12 +124,13 @@ def write_table(
     Raises
     ------
     ValueError
-        When the parts belong to other stations.
+        When the parts belong to other stations, or some are compact and others are not.
     TableError
         When the disk is full or the folder cannot be written; no partial file is left.
     """
     if [part.station for part in parts] != list(site.stations):
         raise ValueError("the parts of a table are those of its site's stations, in their order")
+    version = _version(parts)
     remove_abandoned(path.parent, f".{path.name}.partial-")
     partial = None
     try:
@@ -133,7 +138,7 @@ def write_table(
         with _Sink(descriptor, "w+") as sink:
             try:
                 with h5py.File(sink, "w", libver=_LIBVER, alignment_threshold=1, alignment_interval=64) as file:
-                    table_id = _write_content(file, site, scene, parts, software_version, progress)
+                    table_id = _write_content(file, version, site, scene, parts, software_version, progress)
             finally:
                 sink.raise_failure()
             os.fsync(sink.fileno())
@@ -152,6 +157,15 @@ def write_table(
             with contextlib.suppress(OSError):
                 partial.unlink()
     return table_id
+
+
+def _version(parts: Sequence[StationPart]) -> int:
+    """Version of the format that holds these parts."""
+    levels = [level.is_compact for part in parts for level in part.levels]
+    maps = [part.paths.is_compact for part in parts if part.paths is not None]
+    if len({*levels, *maps}) > 1:
+        raise ValueError("some components or path maps of the table are compact, others are not")
+    return FORMAT_VERSION if all(levels) else WHOLE_VERSION
 
 
 class _Sink(io.FileIO):
@@ -191,6 +205,7 @@ class _Sink(io.FileIO):
 
 def _write_content(
     file: h5py.File,
+    version: int,
     site: SiteInfo,
     scene: Scene,
     parts: Sequence[StationPart],
@@ -205,7 +220,7 @@ def _write_content(
         _write_part(file, part, scene.origin)
         done += part.num_bytes
         progress(done, total)
-    file.attrs["format_version"] = FORMAT_VERSION
+    file.attrs["format_version"] = version
     for name, text in (("format", FORMAT), ("software_version", software_version), ("scene_sha256", scene.sha256)):
         write_text(file, name, text)
     digests = {name: read_text(file[name], "sha256") for name in dataset_paths(file)}
@@ -261,23 +276,33 @@ def _write_scene(file: h5py.File, scene: Scene) -> None:
 
 def _write_level(group: h5py.Group, level: Level) -> None:
     group.attrs["window_deg"] = float(np.rad2deg(level.window))
+    if level.is_compact:  # the unit of angles, to the last bit
+        group.attrs["window_rad"] = level.window
     _write(group, "ring_cells", level.grid.ring_cells.astype(np.int64))
     _write(group, "cell_offsets", level.cell_offsets.astype(np.int64))
     _write(group, "cell_log_mass", level.cell_log_mass.astype(np.float64))
-    stored = level.mixture.as_stored()
-    for name in FIELD_SHAPES:
+    mixture, balance_name = level.mixture, "log_balance16" if level.is_compact else "log_balance"
+    stored = mixture.as_stored() if isinstance(mixture, TubeMixture) else mixture
+    for name in COMPACT_FIELDS if level.is_compact else FIELD_SHAPES:
         if name != "num_walls" or stored.num_walls.any():
             _write(group, name, getattr(stored, name))
     if len(level.log_balance):
-        _write(group, "log_balance", level.log_balance.astype(np.float32))
+        _write(group, balance_name, level.log_balance.astype(np.float16 if level.is_compact else np.float32))
 
 
 def _write_paths(group: h5py.Group, paths: PathMap) -> None:
     group.attrs["origin_m"] = paths.origin
     group.attrs["voxel_size_m"] = paths.voxel_size
     group.attrs["shape"] = np.array(paths.shape)
+    compact = {}
+    if paths.is_compact:
+        group.attrs["weight_unit"] = paths.weight_unit
+        compact["weight"] = COMPACT_WEIGHT
+        if paths.sequence.dtype == np.uint16:
+            compact["sequence"] = COMPACT_SEQUENCE
     for name, (dtype, _) in PATH_DATASETS.items():
-        _write(group, name, getattr(paths, name).astype(dtype))
+        array = getattr(paths, name)
+        _write(group, compact.get(name, name), array if name in compact else array.astype(dtype))
 
 
 def _write_update(group: h5py.Group, update: Update) -> None:

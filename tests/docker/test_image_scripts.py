@@ -113,6 +113,10 @@ def test_a_service_that_is_not_ready_is_told(monkeypatch: pytest.MonkeyPatch):
     assert "/readyz" in done.stderr
 
 
+HALF = 2.0**-11
+"""Largest relative error of the table's slopes."""
+
+
 def test_the_rooms_tubes_are_those_of_straight_paths(room_path: Path):
     table = Table.open(room_path)
     station = table.site.stations[0]
@@ -121,13 +125,13 @@ def test_the_rooms_tubes_are_those_of_straight_paths(room_path: Path):
         # The mean lies at the path length's distance, and its derivative by the length is the unit vector there.
         offset = mixture.x_mean - station.position
         length = mixture.u_mean[:, :1]
-        assert offset == pytest.approx(length * mixture.jacobian[:, :, 0], abs=1e-5)
+        assert offset == pytest.approx(length * mixture.jacobian[:, :, 0], abs=HALF * length.max())
         assert (offset**2).sum(axis=1) == pytest.approx(length[:, 0] ** 2, rel=1e-5)
         # Derivatives by the angles are as long as the path, and at right angles to it and to each other.
         gram = mixture.jacobian.transpose(0, 2, 1) @ mixture.jacobian
         lengths = length[:, 0] ** 2
         for axis in (1, 2):
-            assert gram[:, axis, axis] == pytest.approx(lengths, rel=1e-4)
-            assert gram[:, 0, axis] == pytest.approx(0 * lengths, abs=1e-5)
-        assert gram[:, 1, 2] == pytest.approx(0 * lengths, abs=1e-4)
+            assert gram[:, axis, axis] == pytest.approx(lengths, rel=3.0 * HALF)
+            assert gram[:, 0, axis] == pytest.approx(0 * lengths, abs=3.0 * HALF * length.max())
+        assert gram[:, 1, 2] == pytest.approx(0 * lengths, abs=3.0 * HALF * lengths.max())
     assert table.scene.free_space.volume == pytest.approx(ROOM.prod())

@@ -78,7 +78,7 @@ def test_another_programs_hdf5_file(tmp_path: Path) -> None:
     assert "HDF5 file but not a rayfix table" in refused(path, NotATableError, "give a file that 'rayfix build' wrote")
 
 
-@pytest.mark.parametrize("version", [0, 5, 99, "1", -1])
+@pytest.mark.parametrize("version", [0, 6, 99, "1", -1])
 def test_another_format_version(small_table_path: Path, version: int | str) -> None:
     with h5py.File(small_table_path, "r+") as file:
         file.attrs["format_version"] = version
@@ -310,14 +310,14 @@ def test_a_changed_byte_anywhere_is_found_or_has_no_effect(
 def test_the_hall_table_is_whole_and_a_change_is_found(hall_table_copy: Path, hall_table_path: Path) -> None:
     Table.open(hall_table_path).verify()
     with h5py.File(hall_table_copy) as file:
-        offset = file["stations/bs2/levels/0/u_cov"].id.get_offset()
+        offset = file["stations/bs2/levels/0/u_root16"].id.get_offset()
     with hall_table_copy.open("r+b") as file:
         file.seek(offset + 4)
         byte = file.read(1)[0]
         file.seek(offset + 4)
         file.write(bytes([byte ^ 1]))
     table = Table.open(hall_table_copy)
-    with pytest.raises(CorruptTableError, match="the checksum of stations/bs2/levels/0/u_cov does not match"):
+    with pytest.raises(CorruptTableError, match="the checksum of stations/bs2/levels/0/u_root16 does not match"):
         table.verify()
     shutil.copy(hall_table_path, hall_table_copy)
     Table.open(hall_table_copy).verify()

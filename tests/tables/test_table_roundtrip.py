@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rayfix_tables.disk.schema import FORMAT_VERSION, array_digest, read_text, write_text
+from rayfix_tables.disk.schema import WHOLE_VERSION, array_digest, read_text, write_text
 from rayfix_tables.errors import CorruptTableError
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
@@ -129,7 +129,7 @@ def test_round_trip(
     table = Table.open(path)
     assert_same_table(table, content)
     assert table.table_id == table_id
-    assert (table.path, table.format_version, table.software_version) == (path, FORMAT_VERSION, "1.2.3")
+    assert (table.path, table.format_version, table.software_version) == (path, WHOLE_VERSION, "1.2.3")
     table.verify()
     assert [entry.name for entry in path.parent.iterdir()] == ["table.h5"]
 
@@ -249,6 +249,15 @@ def test_a_table_of_format_3_is_still_read(make_content: Callable[..., Any]) -> 
     table.verify()
 
 
+def test_a_table_of_format_4_is_still_read(make_content: Callable[..., Any]) -> None:
+    """Its components are not compact."""
+    table = Table.open(Path(__file__).parent / "stored" / "format-4.h5")
+    assert_same_table(table, make_content(1, num_stations=1, num_levels=1))
+    assert table.format_version == 4
+    assert table.table_id == "5493cdcca5929250836251990f1700f2010c9503c0e527b07f7b9aeff66fcefd"
+    table.verify()
+
+
 def far_content(make_content: Callable[..., Any]) -> Any:
     """Content whose scene and stations lie at whole metres far away; components count from there."""
     content = make_content(7)
@@ -304,7 +313,7 @@ def test_the_site_is_plain_json(small_table_path: Path, make_content: Callable[.
     """Other programs can read it."""
     with h5py.File(small_table_path) as file:
         assert read_text(file, "format") == "rayfix-table"
-        assert file.attrs["format_version"] == FORMAT_VERSION
+        assert file.attrs["format_version"] == WHOLE_VERSION
         document = json.loads(file["site"][()].tobytes())
     site = make_content(1).site
     assert document["station_ids"] == ["bs0", "bs1"]

@@ -12,9 +12,9 @@ from rayfix_offline.fit.settings import CoarseFit, ExpectationMaximisation, Tube
 from rayfix_offline.fit.tubes import fit_tubes
 from rayfix_offline.fit.wide_windows import sum_cells
 from rayfix_offline.rays.trace import LevelRays
+from rayfix_tables.compact.tubes import CompactTubes, compacted
 from rayfix_tables.grid import AngularGrid
-from rayfix_tables.level import Level
-from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+from rayfix_tables.level import COMPACT_UNBALANCED, Level
 
 _COLUMNS = ("cells", "counts", "log_mass", "change", "dropped")
 """Fields of :class:`FittedCells` with a number for each cell."""
@@ -35,8 +35,8 @@ class FittedCells:
         fitted to this scene.
     dropped : ndarray of int64, shape (n_cells,)
         Components of each cell that were dropped, see :class:`~rayfix_offline.fit.tubes.Fitted`; 0 for one of a table.
-    mixture : TubeMixture
-        Components of all cells.
+    mixture : CompactTubes
+        Components of all cells, rounded to what the table holds: balance, wide cells and updates go on from them.
     """
 
     cells: NDArray[np.int64]
@@ -44,11 +44,12 @@ class FittedCells:
     log_mass: NDArray[np.float64]
     change: NDArray[np.float32]
     dropped: NDArray[np.int64]
-    mixture: TubeMixture
+    mixture: CompactTubes
 
     @classmethod
     def of_level(cls, level: Level, cells: NDArray[np.int64], change: NDArray[np.float64]) -> "FittedCells":
-        """Take cells out of a level."""
+        """Take cells out of a level, whose components are compact."""
+        assert isinstance(level.mixture, CompactTubes)
         counts = level.cell_offsets[cells + 1] - level.cell_offsets[cells]
         return cls(
             cells=cells,
@@ -56,7 +57,7 @@ class FittedCells:
             log_mass=level.cell_log_mass[cells],
             change=change.astype(np.float32),
             dropped=np.zeros(len(cells), np.int64),
-            mixture=level.mixture[_ranges(level.cell_offsets[cells], counts)],
+            mixture=level.mixture.take(_ranges(level.cell_offsets[cells], counts)),
         )
 
     def joined(self, other: "FittedCells") -> "FittedCells":
@@ -65,26 +66,25 @@ class FittedCells:
         order = np.argsort(cells)
         counts = np.concatenate([self.counts, other.counts])
         starts = np.cumsum(counts) - counts
-        mixture = TubeMixture.concatenate([self.mixture, other.mixture])
+        mixture = CompactTubes.concatenate([self.mixture, other.mixture], self.mixture.window)
         return FittedCells(
             cells=cells[order],
             counts=counts[order],
             log_mass=np.concatenate([self.log_mass, other.log_mass])[order],
             change=np.concatenate([self.change, other.change])[order],
             dropped=np.concatenate([self.dropped, other.dropped])[order],
-            mixture=mixture[_ranges(starts[order], counts[order])],
+            mixture=mixture.take(_ranges(starts[order], counts[order])),
         )
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of a shard."""
         columns = {name: getattr(self, name) for name in _COLUMNS}
-        return columns | {name: getattr(self.mixture, name) for name in FIELD_SHAPES}
+        return columns | self.mixture.to_arrays()
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> "FittedCells":
         """Return the cells whose :meth:`to_arrays` gave these arrays."""
-        mixture = TubeMixture(**{name: arrays[name] for name in FIELD_SHAPES})
-        return cls(**{name: arrays[name] for name in _COLUMNS}, mixture=mixture)
+        return cls(**{name: arrays[name] for name in _COLUMNS}, mixture=CompactTubes.from_arrays(arrays))
 
 
 def _ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -100,7 +100,14 @@ def fit_cells(cells: NDArray[np.int64], level: LevelRays, fit: TubeFit | Expecta
         fitted = fit_em(centres, cells, level, fit)
     else:
         fitted = fit_tubes(centres, level, fit)
-    return FittedCells(cells=cells, change=np.zeros(len(cells), np.float32), **fitted._asdict())
+    return FittedCells(
+        cells=cells,
+        counts=fitted.counts,
+        log_mass=fitted.log_mass,
+        change=np.zeros(len(cells), np.float32),
+        dropped=fitted.dropped,
+        mixture=compacted(fitted.mixture, level.window),
+    )
 
 
 def widen_cells(
@@ -119,7 +126,7 @@ def widen_cells(
         log_mass=summed.log_mass,
         change=summed.change.astype(np.float32),
         dropped=summed.dropped,
-        mixture=summed.mixture,
+        mixture=compacted(summed.mixture, window),
     )
 
 
@@ -141,7 +148,8 @@ def assemble_level(window: float, grid: AngularGrid, parts: Sequence[FittedCells
         grid=grid,
         cell_offsets=np.concatenate([[0], np.cumsum(counts)]),
         cell_log_mass=log_mass,
-        mixture=TubeMixture.concatenate([part.mixture for part in parts]),
+        mixture=CompactTubes.concatenate([part.mixture for part in parts], window),
+        log_balance=COMPACT_UNBALANCED,
     )
 
 

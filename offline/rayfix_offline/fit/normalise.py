@@ -21,12 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rayfix_offline.fit.settings import BalanceSettings
+from rayfix_tables.compact.expanding import expanded_tubes
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.gaussians.conditioning import Conditioned, MeasuredCells, condition_on_angle
 from rayfix_tables.gaussians.constants import LOG_2PI
 from rayfix_tables.gaussians.definite import cholesky_factors
 from rayfix_tables.gaussians.normal_points import normal_points
-from rayfix_tables.level import UNBALANCED, Level
+from rayfix_tables.level import Level
 
 _CHUNK = 2**16
 """Number of components that are conditioned at a time."""
@@ -59,7 +60,7 @@ def balanced(
     """
     settings = settings or BalanceSettings()
     if not len(level.mixture):
-        return replace(level, log_balance=UNBALANCED)
+        return replace(level, log_balance=level.log_balance[:0])
     positions = _positions(level, settings, advance)
     points = np.array(normal_points(settings.num_points))
     blocks = _blocks(free_space, settings.block_size)
@@ -74,7 +75,7 @@ def balanced(
         weight *= gain
         log_balance += np.log(gain)
         advance(len(weight))
-    return replace(level, log_balance=log_balance.astype(np.float32))
+    return replace(level, log_balance=log_balance.astype(np.float16 if level.is_compact else np.float32))
 
 
 class _Positions(NamedTuple):
@@ -127,7 +128,7 @@ def _positions(level: Level, settings: BalanceSettings, advance: Callable[[int],
     left = window - noise
     log_factor = np.repeat(np.log(level.grid.solid_angles), level.grid.ring_cells) + level.cell_log_mass
     log_factor += LOG_2PI + 2.0 * np.log(window) - np.log(left)
-    mixture, count = level.mixture, len(level.mixture)
+    count = len(level.mixture)
     weight = np.empty(count)
     mean, root = np.empty((count, 3), np.float32), np.empty((count, 3, 3), np.float32)
     for first, last in level.ranges(_CHUNK):
@@ -135,13 +136,13 @@ def _positions(level: Level, settings: BalanceSettings, advance: Callable[[int],
         cells = slice(first, last)
         log_evidence, at, cov = np.empty(end - begin), np.empty((end - begin, 4)), np.empty((end - begin, 4, 4))
         measured = MeasuredCells(
-            begins=np.asarray(level.cell_offsets[:-1][cells], np.int64),
-            ends=np.asarray(level.cell_offsets[1:][cells], np.int64),
+            begins=np.asarray(level.cell_offsets[:-1][cells], np.int64) - begin,
+            ends=np.asarray(level.cell_offsets[1:][cells], np.int64) - begin,
             rest_mean=np.zeros((last - first, 2)),
             rest_cov=np.repeat(np.array([[1.0, 0.0, 1.0]]) * window * noise / left, last - first, axis=0),
             log_factor=log_factor[cells],
         )
-        condition_on_angle(mixture.tubes, measured, Conditioned(log_evidence, at, cov))
+        condition_on_angle(expanded_tubes(level.mixture, begin, end), measured, Conditioned(log_evidence, at, cov))
         weight[begin:end], mean[begin:end] = np.exp(log_evidence), at[:, :3]
         root[begin:end], definite = cholesky_factors(cov[:, :3, :3] + settings.thickness * np.eye(3))
         # A component without a covariance has no position: it adds to no block, and its weight does not change.

@@ -129,7 +129,7 @@ def joint_to_tubes(
     *,
     position_floor: float,
 ) -> TubeMixture:
-    """Convert joint moments of (u, x) into those of u and of x given u, as the table has them.
+    """Convert joint moments of (u, x) into those of u and of x given u, in double precision.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def joint_to_tubes(
         jacobian=jacobian,
         x_cov=pack(x_cov),
         **labels._asdict(),
-    ).as_stored()
+    )
 
 
 @numba.njit(cache=True, nogil=True)

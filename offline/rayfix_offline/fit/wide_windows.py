@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rayfix_offline.fit.moments import SIZE
 from rayfix_offline.fit.settings import CoarseFit
 from rayfix_offline.fit.tubes import Labels, fitted_cells
+from rayfix_tables.compact.expanding import expanded_tubes
 from rayfix_tables.gaussians.tree_reduction import halve_and_merge
 from rayfix_tables.gaussians.triangles import unpack_upper
 from rayfix_tables.level import Level
@@ -34,17 +35,17 @@ class _FinerCells(NamedTuple):
     cell_offsets: NDArray[np.int64]
     cell_log_mass: NDArray[np.float64]
     cell_change: NDArray[np.float64]
-    log_weight: NDArray[np.float32]
-    u_mean: NDArray[np.float32]
-    u_cov: NDArray[np.float32]
-    x_mean: NDArray[np.float32]
-    jacobian: NDArray[np.float32]
-    x_cov: NDArray[np.float32]
+    log_weight: NDArray[np.floating]
+    u_mean: NDArray[np.floating]
+    u_cov: NDArray[np.floating]
+    x_mean: NDArray[np.floating]
+    jacobian: NDArray[np.floating]
+    x_cov: NDArray[np.floating]
 
     @classmethod
     def of(cls, level: Level, change: NDArray[np.float64]) -> "_FinerCells":
         """Return the cells of a level, and bounds on their changes as fractions of their present masses."""
-        grid, mixture = level.grid, level.mixture
+        grid, tubes = level.grid, expanded_tubes(level.mixture, 0, len(level.mixture))
         return cls(
             window=level.window,
             ring_offsets=grid.ring_offsets,
@@ -53,12 +54,7 @@ class _FinerCells(NamedTuple):
             cell_offsets=level.cell_offsets,
             cell_log_mass=level.cell_log_mass,
             cell_change=change,
-            log_weight=mixture.log_weight,
-            u_mean=mixture.u_mean,
-            u_cov=mixture.u_cov,
-            x_mean=mixture.x_mean,
-            jacobian=mixture.jacobian,
-            x_cov=mixture.x_cov,
+            **tubes._asdict(),
         )
 
 

@@ -49,6 +49,8 @@ class LocalEngine:
     ) -> FittedBlocks:
         """Make blocks of a wide level in parallel; they come back in their order."""
         job = self._job
+        if blocks:
+            finer = finer.expanded  # once for all blocks, and not in each
         tasks = (
             delayed(widen_cells)(
                 block.cells, job.window(block.level), job.grid(block.level), finer, finer_change, job.method.wide

@@ -16,7 +16,7 @@ from rayfix_tables.geometry.angles import direction
 from rayfix_tables.geometry.mounting import board_to_scene
 from rayfix_tables.site import Station
 
-BUILD_VERSION = 8
+BUILD_VERSION = 9
 """Raised with every change of the code that changes a table; numbers that do are part of the method."""
 
 BLOCK_CELLS = 256

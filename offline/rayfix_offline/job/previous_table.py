@@ -109,7 +109,7 @@ class FormerTable:
         for part in self.table.parts.values():
             update = part.update
             near = update is not None and update.exact_part_id == plan.part_id and update.largest_change <= tolerance
-            if (part.part_id == plan.part_id or near) and self._sound:
+            if (part.part_id == plan.part_id or near) and part.is_compact and self._sound:
                 return part
         return None
 
@@ -119,7 +119,7 @@ class FormerTable:
         Positions are compared in the tables' frames.
         """
         part = self.table.parts.get(plan.station.id)
-        if part is None or not self._sound or not self._inputs:
+        if part is None or not part.is_compact or not self._sound or not self._inputs:
             return None
         former_site, twin, plans = self._inputs
         former = plans[plan.station.id]

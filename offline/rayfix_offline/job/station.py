@@ -164,5 +164,5 @@ def _assemble(
         coverage=tuple(float(fraction) for fraction in launch["coverage"]),
         wall_coverage=tuple(float(fraction) for fraction in launch["wall_coverage"]),
         cut_power_share=float(launch["cut_power_share"]),
-        paths=PathMap.from_arrays(launch),
+        paths=PathMap.from_arrays(launch).compacted,
     )

@@ -68,33 +68,34 @@ def find_path(part: StationPart, position: NDArray[np.float64]) -> SimulatedPath
         return None
     apart = ((mixture.x_mean - position.astype(np.float32)) ** 2).sum(axis=1)
     near = np.arange(len(apart)) if len(apart) <= _NEAREST else np.argpartition(apart, _NEAREST)[:_NEAREST]
-    cov = joint_cov(mixture[near])
+    tubes = mixture[near]
+    cov = joint_cov(tubes)
     definite = is_definite(cov[:, 3:, 3:])
     dropped = len(near) - int(np.count_nonzero(definite))
     if dropped:
-        near, cov = near[definite], cov[definite]
+        near, tubes, cov = near[definite], tubes[definite], cov[definite]
         if not len(near):
             return None
     cross, x_cov = cov[:, :3, 3:], cov[:, 3:, 3:]
-    from_mean = position - mixture.x_mean[near]
+    from_mean = position - tubes.x_mean
     gain = np.linalg.solve(x_cov, from_mean[:, :, None])[:, :, 0]
     square = np.einsum("ni,ni->n", from_mean, gain)
     cell = np.searchsorted(level.cell_offsets, near, side="right") - 1
-    log_density = level.cell_log_mass[cell] + mixture.log_weight[near]
+    log_density = level.cell_log_mass[cell] + tubes.log_weight
     log_density = log_density - 0.5 * (square + np.linalg.slogdet(x_cov)[1])
     log_density[square > _REACH**2] = -np.inf
     best = int(np.argmax(log_density))
     if log_density[best] == -np.inf:
         return None
-    length, horizontal, vertical = mixture.u_mean[near[best]] + cross[best] @ gain[best]
+    length, horizontal, vertical = tubes.u_mean[best] + cross[best] @ gain[best]
     azimuth, zenith = level.grid.centres[cell[best]]
     return SimulatedPath(
         station_id=part.station.id,
         azimuth=float(wrap(azimuth + horizontal / np.sin(zenith))),
         zenith=float(np.clip(zenith + vertical, 0.0, np.pi)),
         path_length=float(length),
-        num_reflections=int(mixture.num_reflections[near[best]]),
-        num_walls=int(mixture.num_walls[near[best]]),
+        num_reflections=int(tubes.num_reflections[best]),
+        num_walls=int(tubes.num_walls[best]),
         dropped=dropped,
     )
 

@@ -22,6 +22,9 @@ from numpy.typing import NDArray
 from rayfix_tables.disk.files import OpenFile
 from rayfix_tables.disk.schema import (
     CELL_CHANGE,
+    COMPACT_LEVEL_DATASETS,
+    COMPACT_LOG_BALANCE,
+    COMPACT_PATH_DATASETS,
     FACE_THICKNESS,
     FORMAT,
     LEVEL_DATASETS,
@@ -51,7 +54,15 @@ _STATION = re.compile(r"stations/[^/]+\Z")
 _PATHS = re.compile(r"stations/[^/]+/paths\Z")
 _LEVEL = re.compile(r"stations/[^/]+/levels/(0|[1-9][0-9]{0,3})\Z")
 _OF_SCENE = {**SCENE_DATASETS, **TEXT_DATASETS, "scene/face_thickness_m": FACE_THICKNESS}
-_OF_LEVELS = {**LEVEL_DATASETS, "num_walls": NUM_WALLS, "log_balance": LOG_BALANCE, "cell_change": CELL_CHANGE}
+_OF_LEVELS = {
+    **LEVEL_DATASETS,
+    **COMPACT_LEVEL_DATASETS,
+    "num_walls": NUM_WALLS,
+    "log_balance": LOG_BALANCE,
+    "log_balance16": COMPACT_LOG_BALANCE,
+    "cell_change": CELL_CHANGE,
+}
+_OF_PATHS = {**PATH_DATASETS, **COMPACT_PATH_DATASETS}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,8 +124,8 @@ def dataset_kind(path: str) -> tuple[np.dtype[Any], int]:
         kind = _OF_SCENE[path]
     elif _LEVEL.match(group) and name in _OF_LEVELS:
         kind = _OF_LEVELS[name]
-    elif _PATHS.match(group) and name in PATH_DATASETS:
-        kind = PATH_DATASETS[name]
+    elif _PATHS.match(group) and name in _OF_PATHS:
+        kind = _OF_PATHS[name]
     else:
         raise ValueError(f"{shown(path)} does not belong to a table")
     return np.dtype(kind[0]), kind[1]

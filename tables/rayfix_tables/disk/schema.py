@@ -9,21 +9,25 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from rayfix_tables.compact.tubes import COMPACT_FIELDS
 from rayfix_tables.mixture import FIELD_DTYPES, FIELD_SHAPES
-from rayfix_tables.paths import PATH_FIELDS
+from rayfix_tables.paths import COMPACT_PATH_FIELDS, PATH_FIELDS
 from rayfix_tables.site import NO_BIAS, Mounting, Station, StationBias
 
 FORMAT = "rayfix-table"
-FORMAT_VERSION = 4
-"""Version that is written."""
+FORMAT_VERSION = 5
+"""Version that a build writes: its components and path maps are compact."""
+
+WHOLE_VERSION = 4
+"""Last version whose components and path maps are not; of these it is written still."""
 
 TEXT_IN_HEAPS = 1
 """Oldest version that is also read: its texts are attributes of variable length, stored in a heap of the file."""
 
-READ_VERSIONS = (TEXT_IN_HEAPS, 2, 3, FORMAT_VERSION)
+READ_VERSIONS = (TEXT_IN_HEAPS, 2, 3, WHOLE_VERSION, FORMAT_VERSION)
 
-ARRAYS_VERSION = 1
-"""Version of the meaning of a part's arrays. It is the same in all format versions, which permits reuse of parts."""
+ARRAYS_VERSION = 2
+"""Version of the meaning of a part's arrays: 1 until version 4 of the format, whose parts are not reused."""
 
 TEXT_DATASETS: dict[str, tuple[type[np.generic], int]] = {"site": (np.uint8, 1), "scene/materials": (np.uint8, 1)}
 """Type and number of axes of the datasets that hold JSON, in UTF-8."""
@@ -36,13 +40,24 @@ SCENE_DATASETS: dict[str, tuple[type[np.generic], int]] = {
 }
 """Type and number of axes of the scene's datasets."""
 
-LEVEL_DATASETS: dict[str, tuple[type[np.generic], int]] = {
+CELL_DATASETS: dict[str, tuple[type[np.generic], int]] = {
     "ring_cells": (np.int64, 1),
     "cell_offsets": (np.int64, 1),
     "cell_log_mass": (np.float64, 1),
+}
+"""Type and number of axes of the datasets of a level's cells."""
+
+LEVEL_DATASETS: dict[str, tuple[type[np.generic], int]] = {
+    **CELL_DATASETS,
     **{name: (FIELD_DTYPES[name], 1 + len(shape)) for name, shape in FIELD_SHAPES.items() if name != "num_walls"},
 }
 """Type and number of axes of a level's datasets."""
+
+COMPACT_LEVEL_DATASETS: dict[str, tuple[type[np.generic], int]] = {
+    **CELL_DATASETS,
+    **{name: (dtype, 1 + len(shape)) for name, (dtype, shape) in COMPACT_FIELDS.items() if name != "num_walls"},
+}
+"""Type and number of axes of the datasets of a level of compact components."""
 
 FACE_THICKNESS: tuple[type[np.generic], int] = (np.float64, 1)
 """Type and number of axes of ``scene/face_thickness_m``, which only scenes with a known thickness have."""
@@ -53,12 +68,18 @@ NUM_WALLS: tuple[type[np.generic], int] = (FIELD_DTYPES["num_walls"], 1)
 LOG_BALANCE: tuple[type[np.generic], int] = (np.float32, 1)
 """Type and number of axes of a level's ``log_balance``, which only balanced levels have."""
 
+COMPACT_LOG_BALANCE: tuple[type[np.generic], int] = (np.float16, 1)
+"""Type and number of axes of ``log_balance16``, which is ``log_balance`` of compact components."""
+
 CELL_CHANGE: tuple[type[np.generic], int] = (np.float32, 1)
 """Type and number of axes of a level's ``cell_change``, which only updated parts have."""
 
 
 PATH_DATASETS = PATH_FIELDS
 """Type and number of axes of the datasets of a station's path map: since version 3, those of gains since version 4."""
+
+COMPACT_PATH_DATASETS = COMPACT_PATH_FIELDS
+"""The same of what a compact path map has instead of some of them: since version 5."""
 
 
 def level_path(station_id: str, level: int) -> str:

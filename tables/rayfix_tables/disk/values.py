@@ -6,17 +6,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_AT_A_TIME = 1 << 20
+from rayfix_tables.compact.tubes import DIAGONAL
+
+_AT_A_TIME = 1 << 17
 """Numbers that are checked at a time, to keep temporary copies small."""
+
+_HALF_MAGNITUDE, _HALF_INFINITY = np.uint16(0x7FFF), np.uint16(0x7C00)
+"""Bits of a number of half precision without its sign; what is not finite is at least infinity's."""
 
 
 def check_finite(arrays: Iterable[tuple[str, NDArray[Any]]]) -> None:
     """Check that all numbers are finite, except logarithms of a cell's mass, which may be -inf.
 
+    Lengths of compact components and diagonals of their roots must be positive, too.
+
     Raises
     ------
     ValueError
-        When one has; the message names it.
+        When an array has others; the message names it.
     """
     for name, array in arrays:
         if array.dtype.kind != "f":
@@ -24,9 +31,26 @@ def check_finite(arrays: Iterable[tuple[str, NDArray[Any]]]) -> None:
         flat, empty_cells = array.reshape(-1), name.endswith("/cell_log_mass")
         for begin in range(0, flat.size, _AT_A_TIME):
             part = flat[begin : begin + _AT_A_TIME]
-            good = np.isfinite(part) | (part == -np.inf) if empty_cells else np.isfinite(part)
-            if not good.all():
+            if array.dtype == np.float16:  # of which NumPy asks ten times as slowly
+                good = (part.view(np.uint16) & _HALF_MAGNITUDE).max() < _HALF_INFINITY
+            else:
+                good = (np.isfinite(part) | (part == -np.inf) if empty_cells else np.isfinite(part)).all()
+            if not good:
                 raise ValueError(f"{name} has numbers that are not finite")
+        _check_positive(name, array)
+
+
+def _check_positive(name: str, array: NDArray[Any]) -> None:
+    """Check what compact components are divided by: their lengths, and the diagonals of their roots."""
+    field = name.rpartition("/")[2]
+    if field == "length":
+        divisors = array
+    elif field in ("u_root16", "x_root16"):
+        divisors = array[:, DIAGONAL]
+    else:
+        return
+    if array.size and not float(divisors.min()) > 0.0:
+        raise ValueError(f"{name} has numbers that are not positive")
 
 
 def check_range(name: str, array: NDArray[Any], least: int, most: int) -> None:

@@ -28,6 +28,7 @@ OF_TABLES = (
     "level",
     "grid",
     "mixture",
+    "compact.tubes",
 )
 
 SETTINGS = {
@@ -131,6 +132,13 @@ NOT_IN_IDENTITY = {
     "tables.level.WINDOW_RATIO": "the default of window_ratio in CoarseFit and BalanceSettings",
     "tables.level.UNBALANCED": "an empty array",
     "tables.level.WIDE_RATIO": "of the look-up, not of the table",
+    "tables.compact.tubes.COMPACT_FIELDS": "the table's format, whose version is in the identity",
+    "tables.compact.tubes.WEIGHT_STEPS": "the table's format, whose version is in the identity",
+    "tables.compact.tubes.DIAGONAL": "the table's format, whose version is in the identity",
+    "tables.compact.tubes.LEAST_DIAGONAL": "the table's format, whose version is in the identity",
+    "tables.compact.tubes._LARGEST": "the table's format, whose version is in the identity",
+    "tables.compact.tubes._LOWER": "the table's format, whose version is in the identity",
+    "tables.level.COMPACT_UNBALANCED": "an empty array",
     "tables.mixture.FIELD_SHAPES": "the table's format, whose version is in the identity",
     "tables.mixture._UPPER": "the table's format, whose version is in the identity",
     "tables.mixture._UNPACK": "the table's format, whose version is in the identity",

@@ -11,6 +11,7 @@ from rayfix_tables.errors import BuildError, TableError
 from rayfix_tables.geometry.mounting import boresight_of
 from rayfix_tables.mixture import FIELD_SHAPES
 from rayfix_tables.table import Table
+from tests.support.tables.compact_copies import former_copy
 
 SITE = """\
 [site]
@@ -69,6 +70,16 @@ def station(summary: BuildSummary, name: str) -> tuple[str, float]:
     """Where a station's part came from, and the share of its cells that was kept."""
     (found,) = [s for s in summary.stations if s.station_id == name]
     return found.origin, found.num_kept_cells / found.num_finest_cells
+
+
+def test_parts_of_a_former_format_are_built_again(former: Path, tmp_path: Path) -> None:
+    """Their numbers are not those that a build would round; the table is what it is without them."""
+    whole = Table.open(former)
+    old = former_copy(whole, tmp_path / "old.h5")
+    assert (whole.format_version, old.format_version) == (5, 4)
+    summary = build_table(write_site(tmp_path / "site"), tmp_path / "new.h5", former=old.path, jobs=1)
+    assert [station(summary, name)[0] for name in ("left", "right")] == ["built", "built"]
+    assert summary.table_id == whole.table_id
 
 
 def assert_within_its_changes(table: Table, whole: Table) -> dict[str, float]:

@@ -121,7 +121,7 @@ def test_the_level_follows_the_deviation(table: Table):
 
 
 def test_a_direction_without_rays_is_empty(table: Table):
-    level = table.parts["bs1"].levels[0]
+    level = table.parts["bs1"].levels[0].expanded
     bare = replace(
         level,
         cell_offsets=np.zeros_like(level.cell_offsets),
@@ -181,6 +181,7 @@ def test_a_simulated_path_is_one_of_the_forward_solvers(table: Table):
 def test_a_simulated_path_is_of_no_component_without_a_covariance(table: Table):
     part = table.parts["bs1"]
     (finest, *others), place = part.levels, np.array(EXAMPLE_POSITION)
+    finest = finest.expanded
     whole = find_path(part, place)
     assert whole is not None
     broken = finest.mixture.x_cov.copy()

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from rayfix_tables.compact.tubes import CompactTubes, compacted
 from rayfix_tables.freespace import FreeSpace
 from rayfix_tables.grid import AngularGrid
 from rayfix_tables.level import Level
-from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture
+from rayfix_tables.mixture import FIELD_SHAPES, TubeMixture, pack
 from rayfix_tables.part import StationPart
 from rayfix_tables.paths import PathMap
 from rayfix_tables.scene import Scene
@@ -139,3 +140,44 @@ def random_content(
         scene=scene,
         parts=tuple(replace(part, paths=random_paths(rng, scene.free_space, walls=walls)) for part in parts),
     )
+
+
+def random_tubes(rng: np.random.Generator, count: int, window: float, *, longest: float = 50.0) -> TubeMixture:
+    """Tubes like those of rays, in double precision: spreads from millimetres to metres, correlated at random."""
+    length = rng.uniform(0.05, longest, count)
+    turn = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0] + 0.05 * rng.normal(size=(count, 3, 3))
+    roots = []
+    for least, most in ((0.02, 2.0), (2e-3, 1.0)):
+        root = np.tril(rng.normal(size=(count, 3, 3)), -1) * 10.0 ** rng.uniform(-3.0, 0.0, (count, 1, 1))
+        root[:, range(3), range(3)] = np.exp(rng.uniform(np.log(least), np.log(most), (count, 3)))
+        roots.append(root)
+    roots[0][:, 1:] *= window
+    return TubeMixture(
+        log_weight=-rng.exponential(4.0, count),
+        u_mean=np.column_stack([length, window * rng.normal(size=(count, 2))]),
+        u_cov=pack(roots[0] @ roots[0].transpose(0, 2, 1)),
+        x_mean=rng.uniform(-longest, longest, (count, 3)),
+        jacobian=turn * np.stack([np.ones(count), length, length], axis=-1)[:, None],
+        x_cov=pack(roots[1] @ roots[1].transpose(0, 2, 1)),
+        num_reflections=rng.integers(0, 4, count).astype(np.int8),
+        num_walls=np.zeros(count, np.int8),
+    )
+
+
+def compact_content(seed: int, *, walls: bool = False, **sizes: int) -> Content:
+    """Fill a table with compact components and path maps."""
+    content = random_content(seed, walls=walls, **sizes)
+    rng = np.random.default_rng([seed, 5])
+
+    def compact(level: Level) -> Level:
+        tubes = random_tubes(rng, len(level.mixture), level.window)
+        tubes = replace(tubes, num_walls=level.mixture.num_walls)
+        return replace(level, mixture=compacted(tubes, level.window), log_balance=level.log_balance.astype(np.float16))
+
+    parts = []
+    for part in content.parts:
+        assert part.paths is not None
+        levels = tuple(compact(level) for level in part.levels)
+        assert all(isinstance(level.mixture, CompactTubes) for level in levels)
+        parts.append(replace(part, levels=levels, paths=part.paths.compacted))
+    return replace(content, parts=tuple(parts))

@@ -13,6 +13,8 @@ from rayfix_service.fusion.lookup.lookup import Lookup, look_up
 from rayfix_service.fusion.measurements.directions import NO_DIRECTION, Direction
 from rayfix_service.fusion.measurements.line_of_sight import LineOfSightWeights
 from rayfix_service.fusion.product.merging import merge_gaussians
+from rayfix_tables.compact.expanding import expand, half, no_tubes
+from rayfix_tables.compact.tubes import CompactTubes
 from rayfix_tables.gaussians.conditioning import Conditioned, MeasuredCells, condition_on_angle
 from rayfix_tables.mixture import Tubes
 from rayfix_tables.part import StationPart
@@ -119,10 +121,49 @@ class StationMixtures:
 
 def _condition(lookup: Lookup) -> StationMixture:
     """Condition every component of the cells looked up on the rest of the measured angle."""
-    level = lookup.level
-    components = tuple(level.mixture.tubes), level.log_balance, level.cell_offsets, level.cell_log_mass
+    level, mixture = lookup.level, lookup.level.mixture
     rest_mean, rest_cov = np.ascontiguousarray(lookup.rest_mean), np.ascontiguousarray(lookup.rest_cov)
-    return StationMixture(*_condition_cells(components, (lookup.cells, rest_mean, rest_cov, lookup.log_factor)))
+    looked_up = lookup.cells, rest_mean, rest_cov, lookup.log_factor
+    if isinstance(mixture, CompactTubes):
+        balance = level.log_balance.view(np.uint16)
+        compact = tuple(mixture.arrays), mixture.window, balance, level.cell_offsets, level.cell_log_mass
+        return StationMixture(*_condition_compact_cells(compact, looked_up))
+    components = tuple(mixture.tubes), level.log_balance, level.cell_offsets, level.cell_log_mass
+    return StationMixture(*_condition_cells(components, looked_up))
+
+
+@numba.njit(cache=True, nogil=True)
+def _ranges(looked_up: Any, cell_offsets: Any, cell_log_mass: Any) -> Any:
+    """Ranges of the components of some cells, the logarithms of the cells' factors, and the number of components."""
+    cells, _, _, log_factor = looked_up
+    count = len(cells)
+    begins, ends, log_scale = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
+    total = 0
+    for n in range(count):
+        begins[n], ends[n] = cell_offsets[cells[n]], cell_offsets[cells[n] + 1]
+        log_scale[n] = log_factor[n] + cell_log_mass[cells[n]]
+        total += ends[n] - begins[n]
+    return begins, ends, log_scale, total
+
+
+@numba.njit(cache=True, nogil=True)
+def _condition_compact_cells(components: Any, looked_up: Any) -> Any:
+    """Condition the components of some cells, which are compact; as :func:`_condition_cells`."""
+    stored, window, log_balance, cell_offsets, cell_log_mass = components
+    begins, ends, log_scale, total = _ranges(looked_up, cell_offsets, cell_log_mass)
+    tubes = no_tubes(total)
+    expand(stored, window, begins, ends, tubes)
+    after = np.cumsum(ends - begins)
+    out = Conditioned(np.empty(total), np.empty((total, 4)), np.empty((total, 4, 4)))
+    cells = MeasuredCells(after - (ends - begins), after, looked_up[1], looked_up[2], log_scale)
+    condition_on_angle(tubes, cells, out)
+    if len(log_balance):
+        row = 0
+        for n in range(len(begins)):
+            for k in range(begins[n], ends[n]):
+                out.log_evidence[row] += half(log_balance[k])
+                row += 1
+    return out.log_evidence, out.mean, out.cov
 
 
 @numba.njit(cache=True, nogil=True)
@@ -143,19 +184,12 @@ def _condition_cells(components: Any, looked_up: Any) -> Any:
         As in :class:`StationMixture`.
     """
     tubes, log_balance, cell_offsets, cell_log_mass = components
-    cells, rest_mean, rest_cov, log_factor = looked_up
-    count = len(cells)
-    begins, ends, log_scale = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
-    total = 0
-    for n in range(count):
-        begins[n], ends[n] = cell_offsets[cells[n]], cell_offsets[cells[n] + 1]
-        log_scale[n] = log_factor[n] + cell_log_mass[cells[n]]
-        total += ends[n] - begins[n]
+    begins, ends, log_scale, total = _ranges(looked_up, cell_offsets, cell_log_mass)
     out = Conditioned(np.empty(total), np.empty((total, 4)), np.empty((total, 4, 4)))
-    condition_on_angle(Tubes(*tubes), MeasuredCells(begins, ends, rest_mean, rest_cov, log_scale), out)
+    condition_on_angle(Tubes(*tubes), MeasuredCells(begins, ends, looked_up[1], looked_up[2], log_scale), out)
     if len(log_balance):
         row = 0
-        for n in range(count):
+        for n in range(len(begins)):
             for k in range(begins[n], ends[n]):
                 out.log_evidence[row] += log_balance[k]
                 row += 1

@@ -95,7 +95,7 @@ class BlockPaths(NamedTuple):
     Attributes
     ----------
     offsets : ndarray of int64, shape (n_blocks + 1,)
-    sequence : ndarray of int32, shape (n_paths,)
+    sequence : ndarray of int32 or uint16, shape (n_paths,)
     weight : ndarray of float32, shape (n_paths,)
         Mean over the block's free part.
     excess : ndarray of float32, shape (n_paths,) or (0,), m
@@ -104,7 +104,7 @@ class BlockPaths(NamedTuple):
     """
 
     offsets: NDArray[np.int64]
-    sequence: NDArray[np.int32]
+    sequence: NDArray[np.int32] | NDArray[np.uint16]
     weight: NDArray[np.float32]
     excess: NDArray[np.float32]
     num_walls: NDArray[np.int8]
@@ -126,7 +126,7 @@ class StationPaths:
         self.images, self.mirrors = _read_only(paths.images), _read_only(paths.mirrors)
         self.num_reflections = _read_only(paths.num_reflections)
         if of_voxels is None:
-            of_voxels = BlockPaths(paths.offsets, paths.sequence, paths.weight, paths.excess, paths.num_walls)
+            of_voxels = BlockPaths(paths.offsets, paths.sequence, paths.weight_of_1, paths.excess, paths.num_walls)
         self.levels = [_only_read(of_voxels)]
         for finer, coarser in zip(tree.levels, tree.levels[1:], strict=False):
             joined = _joined(*self.levels[-1], np.array(finer.shape), finer.volume, np.array(coarser.shape))
@@ -159,7 +159,7 @@ def _joined(
     num_blocks = coarser[0] * coarser[1] * coarser[2]
     passes = len(excess) > 0
     new_offsets = np.zeros(num_blocks + 1, np.int64)
-    new_sequence, sums = np.empty(len(sequence), np.int32), np.zeros((len(sequence), 3))
+    new_sequence, sums = np.empty(len(sequence), sequence.dtype), np.zeros((len(sequence), 3))
     total = 0
     for block in range(num_blocks):
         i, j, k = block // (coarser[1] * coarser[2]), block // coarser[2] % coarser[1], block % coarser[2]
