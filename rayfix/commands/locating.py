@@ -126,8 +126,8 @@ def _locate(options: argparse.Namespace) -> int:
 
 def _locate_logs(options: argparse.Namespace) -> int:
     with needs_extra("service"):
+        from rayfix.logs.entries import Task
         from rayfix.logs.layouts import layout_of
-        from rayfix.logs.locating import Task
         from rayfix.logs.run import locate_logs
         from rayfix_service.adapters.adapted import known_height
         from rayfix_tables.checked import open_checked

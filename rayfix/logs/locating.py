@@ -1,19 +1,15 @@
 """Locating the reports of a log: what one process does with a block of them."""
 
-import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from rayfix.logs.entries import Entry, Place, Problem
-from rayfix.logs.layouts import RADII, Layout, piece
-from rayfix.logs.residuals import Residual, residuals
+from rayfix.logs.entries import Located, Place, Problem, Task, Work, shard_of
+from rayfix.logs.layouts import RADII, piece
+from rayfix.logs.residuals import residuals
 from rayfix_service.adapters.adapted import Adapted, with_confidence, with_height
-from rayfix_service.adapters.formats import OutputFormat, write
-from rayfix_service.fusion.measurements.report import Height, Report
-from rayfix_service.fusion.posterior.fix import Fix, Status
-from rayfix_service.fusion.settings import FusionSettings
+from rayfix_service.adapters.formats import write
+from rayfix_service.fusion.measurements.report import Report
+from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_service.locator import Locator
 from rayfix_service.process_wide import collector_paused
 from rayfix_service.tracking.track import TrackedPosition
@@ -21,59 +17,6 @@ from rayfix_service.tracking.tracker import Tracker
 from rayfix_service.wire import fix_to_document, parse_report, report_to_document
 from rayfix_tables.checked import open_checked
 from rayfix_tables.errors import ReportError, TableError
-
-SHARDS = 16
-"""Groups of targets; each is followed in one process, whatever the number of processes, so that tracks are the same."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """How the reports of a log are located and written.
-
-    Attributes
-    ----------
-    table_path : pathlib.Path
-    table_id : str
-        Of the table at that path.
-    layout : {"jsonl", "csv", "geojson", "parquet"}
-    output_format : {"native", "3gpp", "omlox"}
-        Of JSON lines.
-    height, confidence
-        For reports without a height, and instead of the reports' confidence.
-    track : bool
-        Whether targets are followed.
-    with_reports : bool
-        Whether JSON lines hold each fix's report as well.
-    settings : FusionSettings
-    """
-
-    table_path: Path
-    table_id: str
-    layout: Layout
-    output_format: OutputFormat = "native"
-    height: Height | None = None
-    confidence: float | None = None
-    track: bool = False
-    with_reports: bool = False
-    settings: FusionSettings = field(default_factory=FusionSettings)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Located:
-    """A fix as it is written, and what the summary takes of it."""
-
-    place: Place
-    text: bytes
-    status: Status
-    residuals: tuple[Residual, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Work:
-    """An entry, and the newest time of the log up to it, s since 1970, by which targets are forgotten."""
-
-    entry: Entry
-    now: float
 
 
 class LogLocator:
@@ -148,8 +91,3 @@ class LogLocator:
         if self._task.with_reports:
             document["report"] = report_to_document(report)
         return {"log": place.log, "entry": place.entry, **document}
-
-
-def shard_of(target_id: str | None) -> int:
-    """Group of a target, the same in every process."""
-    return hashlib.sha256((target_id or "").encode("utf-8", "surrogatepass")).digest()[0] % SHARDS

@@ -1,4 +1,8 @@
-"""Processes that locate blocks of a log, in order and with no more blocks under way than are needed."""
+"""Processes that locate blocks of a log, in order and with no more blocks under way than are needed.
+
+The process that reads and writes needs no kernel: what locates is imported by those that do, which spares it the
+memory of a compiler.
+"""
 
 import os
 import signal
@@ -10,10 +14,13 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from multiprocessing import get_context
+from typing import TYPE_CHECKING
 
-from rayfix.logs.entries import Problem
-from rayfix.logs.locating import Located, LogLocator, Task, Work, shard_of
+from rayfix.logs.entries import Located, Problem, Task, Work, shard_of
 from rayfix_tables.errors import RayfixError
+
+if TYPE_CHECKING:
+    from rayfix.logs.locating import LogLocator
 
 BLOCK = 64
 """Entries that a process takes at a time."""
@@ -44,7 +51,7 @@ def located(works: Iterable[Work | Problem], task: Task, jobs: int) -> Iterator[
     first = next(blocks, [])
     second = next(blocks, None)
     if jobs < 2 or second is None:
-        locator = LogLocator(task)
+        locator = _log_locator(task)
         for block in _chain(first, second, blocks):
             yield _merged(block, locator.block([w for w in block if isinstance(w, Work)]))
         return
@@ -133,7 +140,13 @@ def _chain(
         yield from blocks
 
 
-_locator: LogLocator | None = None
+_locator: "LogLocator | None" = None
+
+
+def _log_locator(task: Task) -> "LogLocator":
+    from rayfix.logs.locating import LogLocator
+
+    return LogLocator(task)
 
 
 def _start(task: Task, parent: int) -> None:
@@ -141,7 +154,7 @@ def _start(task: Task, parent: int) -> None:
     global _locator
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    _locator = LogLocator(task)
+    _locator = _log_locator(task)
 
 
 def _end_with(parent: int) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rayfix.logs.combining import Combine, joined
 from rayfix.logs.csv_logs import CsvColumns, csv_entries
@@ -10,9 +11,11 @@ from rayfix.logs.entries import Entry, Problem
 from rayfix.logs.files import LogFile, open_log
 from rayfix.logs.joined_lines import has_topics, silabs_topic_entries, ublox_entries
 from rayfix.logs.json_logs import json_elements, native_entries
-from rayfix_service.adapters.formats import InputFormat, parse
 from rayfix_service.adapters.ublox import USUAL_ERRORS, AngleErrors
 from rayfix_tables.errors import ReportError
+
+if TYPE_CHECKING:
+    from rayfix_service.adapters.formats import InputFormat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +38,7 @@ class Reading:
         What becomes of their measurements.
     """
 
-    input_format: InputFormat = "native"
+    input_format: "InputFormat" = "native"
     columns: CsvColumns = field(default_factory=CsvColumns)
     stations: Mapping[str, str] = field(default_factory=dict)
     errors: AngleErrors = USUAL_ERRORS
@@ -112,6 +115,8 @@ def _native(log: LogFile, reading: Reading, state: ReadState) -> Iterator[Entry 
 
 def _messages(log: LogFile, reading: Reading) -> Iterator[Entry | Problem]:
     """Give the reports of other systems' messages in JSON."""
+    from rayfix_service.adapters.formats import parse  # its formats of answers have kernels
+
     for found in json_elements(log):
         if isinstance(found, Problem):
             yield found

@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rayfix.logs.entries import Entry, Problem
+from rayfix.logs.entries import Entry, Problem, Task, Work
 from rayfix.logs.files import fingerprint
 from rayfix.logs.layouts import head, is_fixes, layout_of, tail, to_parquet
-from rayfix.logs.locating import Task, Work
 from rayfix.logs.processes import Result, located
 from rayfix.logs.reading import Reading, ReadState, read_logs
 from rayfix.logs.summary import StationFigures, Summary

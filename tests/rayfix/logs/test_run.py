@@ -2,6 +2,8 @@
 
 import csv
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +11,8 @@ import numpy as np
 import pytest
 
 from rayfix.cli import main
+from rayfix.logs.entries import Task
 from rayfix.logs.layouts import FIX_COLUMNS, Layout
-from rayfix.logs.locating import Task
 from rayfix.logs.reading import Reading
 from rayfix.logs.run import LogRun, locate_logs
 from rayfix_evaluation.truth.forward import ForwardSolver
@@ -216,3 +218,10 @@ def test_the_command(capsys: pytest.CaptureFixture[str], tmp_path: Path, table: 
     for more, message in (([str(log)], "by -o"), (["--track"], "by -o")):
         assert main(["locate", str(table.path), str(log), *more]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_the_process_that_reads_and_writes_needs_no_compiler() -> None:
+    """It would take 30 MB more, and what locates is in the others."""
+    code = "import sys, rayfix.commands.locating, rayfix.logs.run, rayfix.console_logs; print('numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
