@@ -7,10 +7,17 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 
 from rayfix.example.files import write_example
 from rayfix_offline.build import build_table
 from tests.support.checkout import SHARED
+
+# A shared machine may stall for longer than an example may take by default.
+settings.register_profile(
+    "shared machine", parent=settings.default, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("shared machine")
 
 
 @pytest.fixture(scope="session", autouse=True)
