@@ -71,7 +71,7 @@ def test_a_target_is_followed(service_url: str, report: dict[str, Any]):
     assert [track.num_reports for track in tracks if track] == [1, 2, 3, 4, 5]
     assert tracks[-1] is not None
     # Errors of stations drift: five reports within a second tell little more than one, and look like little more.
-    assert tracks[-1].horizontal_accuracy_m == pytest.approx(fixes[0].horizontal_accuracy_m, rel=0.15)
+    assert tracks[-1].horizontal_accuracy_m == pytest.approx(fixes[0].horizontal_accuracy_m, rel=0.1)
 
 
 def test_a_refused_report_names_the_field(service_url: str, report: dict[str, Any]):

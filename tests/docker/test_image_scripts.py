@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from compile_service_kernels import ROOM, write_room
@@ -113,25 +114,36 @@ def test_a_service_that_is_not_ready_is_told(monkeypatch: pytest.MonkeyPatch):
     assert "/readyz" in done.stderr
 
 
-HALF = 2.0**-11
-"""Largest relative error of the table's slopes."""
-
-
-def test_the_rooms_tubes_are_those_of_straight_paths(room_path: Path):
-    table = Table.open(room_path)
+def test_the_rooms_tubes_are_those_of_straight_paths(tmp_path: Path):
+    """Before they are rounded to what a table holds."""
+    write_room(tmp_path / "room.h5", compact=False)
+    table = Table.open(tmp_path / "room.h5")
     station = table.site.stations[0]
     for level in table.levels(station.id):
         mixture = level.mixture
         # The mean lies at the path length's distance, and its derivative by the length is the unit vector there.
         offset = mixture.x_mean - station.position
         length = mixture.u_mean[:, :1]
-        assert offset == pytest.approx(length * mixture.jacobian[:, :, 0], abs=HALF * length.max())
+        assert offset == pytest.approx(length * mixture.jacobian[:, :, 0], abs=1e-5)
         assert (offset**2).sum(axis=1) == pytest.approx(length[:, 0] ** 2, rel=1e-5)
         # Derivatives by the angles are as long as the path, and at right angles to it and to each other.
         gram = mixture.jacobian.transpose(0, 2, 1) @ mixture.jacobian
         lengths = length[:, 0] ** 2
         for axis in (1, 2):
-            assert gram[:, axis, axis] == pytest.approx(lengths, rel=3.0 * HALF)
-            assert gram[:, 0, axis] == pytest.approx(0 * lengths, abs=3.0 * HALF * length.max())
-        assert gram[:, 1, 2] == pytest.approx(0 * lengths, abs=3.0 * HALF * lengths.max())
+            assert gram[:, axis, axis] == pytest.approx(lengths, rel=1e-4)
+            assert gram[:, 0, axis] == pytest.approx(0 * lengths, abs=1e-5)
+        assert gram[:, 1, 2] == pytest.approx(0 * lengths, abs=1e-4)
     assert table.scene.free_space.volume == pytest.approx(ROOM.prod())
+
+
+def test_the_room_is_a_table_of_the_present_format(room_path: Path, tmp_path: Path):
+    """Its components are those of straight paths to half precision."""
+    write_room(tmp_path / "whole.h5", compact=False)
+    table, whole = Table.open(room_path), Table.open(tmp_path / "whole.h5")
+    assert (table.format_version, whole.format_version) == (5, 4)
+    for name, part in table.parts.items():
+        for level, exact in zip(part.levels, whole.parts[name].levels, strict=True):
+            assert level.is_compact
+            most = float(exact.mixture.u_mean[:, 0].max())
+            np.testing.assert_allclose(level.mixture[:].jacobian, exact.mixture.jacobian, atol=2.0**-11 * most)
+            np.testing.assert_allclose(level.mixture[:].u_mean, exact.mixture.u_mean, rtol=2.0**-11, atol=1e-7)
