@@ -1,6 +1,5 @@
 """Reading takes time in proportion to the message at most, and little memory, whatever the message is made of."""
 
-import gc
 import json
 import pickle
 from collections.abc import Callable
@@ -26,6 +25,7 @@ from rayfix_service.wire.limits import USUAL_LIMITS, MessageLimits, has_more_val
 from rayfix_tables.errors import ReportError
 from rayfix_tables.site import SiteInfo, Station
 from rayfix_tables.table import Table
+from tests.support.running.thread_seconds import fastest_thread_seconds
 
 MEBIBYTE = 1 << 20
 
@@ -227,34 +227,15 @@ def attempt(read: Read, message: bytes) -> object:
         return error
 
 
-def seconds(work: Callable[[], object], runs: int) -> float:
-    """Processor time of this thread that the fastest of several runs takes.
-
-    The collector rests, as with ``timeit``: its time grows with what other tests have left in memory.
-    """
-    taken = []
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        for _ in range(runs):
-            begin = thread_time()
-            work()
-            taken.append(thread_time() - begin)
-    finally:
-        if collects:
-            gc.enable()
-    return min(taken)
-
-
 @pytest.mark.parametrize(("case", "size"), CASES)
 def test_eight_times_as_much_takes_at_most_twelve_times_as_long(case: Callable[[int], Callable[[], object]], size: int):
     """The time for u-blox lines grew with the square and cube of their number, that for other messages with errors."""
     small, large = case(size), case(8 * size)
     for runs in (3, 5, 9, 15):
         # What takes less than a millisecond takes no time that could be compared on a busy machine.
-        if seconds(large, runs) <= 12.0 * max(seconds(small, runs), 1e-3):
+        if fastest_thread_seconds(large, runs) <= 12.0 * max(fastest_thread_seconds(small, runs), 1e-3):
             return
-    pytest.fail(f"{seconds(small, 9):.2e} s became {seconds(large, 9):.2e} s")
+    pytest.fail(f"{fastest_thread_seconds(small, 9):.2e} s became {fastest_thread_seconds(large, 9):.2e} s")
 
 
 def filling(make: Make, limit: int = MEBIBYTE) -> bytes:
