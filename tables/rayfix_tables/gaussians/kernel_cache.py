@@ -6,8 +6,14 @@ kernels fails, because numba's decorator looks for the folder. The three package
 :func:`ensure_kernel_cache` in their ``__init__``, which Python runs before any of their modules. ``rayfix_tables`` does
 not, because reading a table needs no folder. Nothing else runs when a package is imported. This is the only module that
 changes the process's environment; worker processes inherit the folder.
+
+numba compiles a kernel anew when its own file has changed. A kernel holds compiled copies of those that it calls, and
+after a change of one of these, as a checkout of another version is, old copies would run with new ones: this ended in
+wrong numbers or a crash. The call therefore forgets the kernels beside the modules when any file of the package, or of
+``rayfix_tables``, has changed.
 """
 
+import hashlib
 import logging
 import os
 import stat
@@ -20,11 +26,14 @@ from rayfix_tables.errors import RayfixError
 
 VARIABLE = "NUMBA_CACHE_DIR"
 
+_STAMP = "kernels.stamp"
+_TABLES = Path(__file__).parents[1]
+
 _log = logging.getLogger("rayfix")
 
 
 def ensure_kernel_cache(package: Path) -> None:
-    """Let numba cache kernels in a private temporary folder if it can write nowhere else.
+    """Forget kernels of other sources, and let numba cache kernels in a temporary folder if it can write nowhere else.
 
     Parameters
     ----------
@@ -36,6 +45,8 @@ def ensure_kernel_cache(package: Path) -> None:
     RayfixError
         When no temporary folder is writable either.
     """
+    for folder, sources in ((_TABLES, (_TABLES,)), (package, (_TABLES, package))):
+        _forget_stale_kernels(folder, sources)
     given = os.environ.get(VARIABLE)
     if any(
         _is_writable(folder) for folder in (given and Path(given), package / "__pycache__", _user_cache()) if folder
@@ -53,6 +64,32 @@ def ensure_kernel_cache(package: Path) -> None:
         given or package,
         VARIABLE,
     )
+
+
+def _forget_stale_kernels(package: Path, sources: tuple[Path, ...]) -> None:
+    """Remove numba's indices beside the modules of a package if they are of other source files than there are now."""
+    stamp = package / "__pycache__" / _STAMP
+    found = _stamp_of(sources)
+    try:
+        if stamp.exists() and stamp.read_bytes() == found:
+            return
+        for index in package.rglob("__pycache__/*.nbi"):
+            index.unlink(missing_ok=True)  # another process may do the same
+        stamp.parent.mkdir(exist_ok=True)
+        stamp.write_bytes(found)
+    except OSError:
+        # Nothing can be written here, so that no kernels were, or they came with the sources.
+        return
+
+
+def _stamp_of(folders: tuple[Path, ...]) -> bytes:
+    """Return a digest of the names, sizes and times of all modules below some folders."""
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted(folder.rglob("*.py")):
+            found = path.stat()
+            digest.update(f"{path.relative_to(folder)} {found.st_size} {found.st_mtime_ns}\n".encode())
+    return digest.hexdigest().encode()
 
 
 def _is_writable(folder: Path) -> bool:

@@ -163,3 +163,38 @@ def test_a_name_that_others_have_taken_is_not_used(run: Run, tmp_path: Path, kin
     assert Path(done.stdout.strip()).is_relative_to(other)
     assert stat.S_IMODE(other.stat().st_mode) == 0o700
     assert not list(tmp_path.rglob("theirs/*"))
+
+
+@pytest.mark.parametrize("changed", ["callee", "caller", "other"])
+def test_kernels_of_a_former_version_are_forgotten(tmp_path: Path, changed: str) -> None:
+    """Numba compared the caller's own file only, and ran its old copy of the callee: wrong numbers, or a crash."""
+    package = tmp_path / "made"
+    (package / "inner").mkdir(parents=True)
+    source = {
+        "callee": "import numba\n\n@numba.njit(cache=True)\ndef one(x):\n    return x + 1.0\n",
+        "caller": "import numba\nfrom made.inner.callee import one\n\n@numba.njit(cache=True)\ndef two(x):\n"
+        "    return one(x) + 1.0\n",
+        "other": "",
+    }
+    head = "from pathlib import Path\nfrom rayfix_tables.gaussians.kernel_cache import ensure_kernel_cache\n"
+    (package / "__init__.py").write_text(f"{head}ensure_kernel_cache(Path(__file__).parent)\n")
+    for name, text in source.items():
+        (package / "inner" / f"{name}.py").write_text(text)
+
+    def value() -> tuple[float, int]:
+        """Return what the kernel gives, and how many were taken from the cache."""
+        script = "from made.inner.caller import two\nprint(two(1.0), sum(two.stats.cache_hits.values()))"
+        environment = {name: text for name, text in os.environ.items() if not name.startswith("NUMBA_")}
+        done = subprocess.run(
+            [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        )
+        number, hits = done.stdout.split()
+        return float(number), int(hits)
+
+    assert value() == (3.0, 0)
+    assert value() == (3.0, 1)
+    text = source[changed]
+    (package / "inner" / f"{changed}.py").write_text(text.replace("+ 1.0", "+ 10.0") or "added = True\n")
+    expected = 3.0 if changed == "other" else 12.0
+    assert value() == (expected, 0)
+    assert value() == (expected, 1)
