@@ -57,7 +57,7 @@ def _stations(summary: "Summary") -> Grid:
         )
     grid.caption = (
         "mean and standard deviation of measured minus straight path to the fix, of fixes with status ok; "
-        "(stated deviation)"
+        "(deviation that the fixes assume)"
     )
     return grid
 
@@ -67,7 +67,7 @@ def _residual(figures: "StationFigures", quantity: str) -> str:
     if moments is None:
         return "-"
     digits = 2 if quantity == "range_m" else 1
-    return f"{moments.mean:+.{digits}f} ± {moments.deviation:.{digits}f} ({moments.stated:.{digits}f})"
+    return f"{moments.mean:+.{digits}f} ± {moments.deviation:.{digits}f} ({moments.assumed:.{digits}f})"
 
 
 def _suspected(summary: "Summary") -> list[str]:

@@ -2,23 +2,24 @@
 
 As a program it takes a table and a file of at least 32 bytes, and serves the table with one worker. The loop is
 asyncio's own: that of uvloop, which the service has otherwise, calls the same callbacks and has no place to measure
-them. With a third argument, a file, it writes there the stacks of all threads whenever the interpreter's lock was held
-for :data:`HELD_SECONDS`, or the machine let nothing of this process run.
+them. With a third argument, a file, it writes there what callbacks do after :data:`HELD_SECONDS` of processor time.
 """
 
 import asyncio.events
-import faulthandler
 import mmap
+import signal
 import sys
-import threading
-import time
+import traceback
 from pathlib import Path
 from time import perf_counter, thread_time
+from types import FrameType
 from typing import Any
 
 from rayfix_service.server.server import serve
 
-HELD_SECONDS = 0.05
+HELD_SECONDS = 0.02
+
+_LOOK_SECONDS = 0.005
 
 _NUMBERS = 4
 
@@ -52,35 +53,39 @@ class LoopTimes:
         return found
 
 
-def watch(times: LoopTimes) -> None:
-    """Have every callback of asyncio's loops in this process measured."""
+def watch(times: LoopTimes, stacks: Path | None = None) -> None:
+    """Have every callback of asyncio's loops in this process measured, and stacks of long ones written to a file."""
     run = asyncio.events.Handle._run
+    begin, clock, shown = 0.0, 0.0, True
 
     def measured(self: Any) -> None:
-        begin, clock = thread_time(), perf_counter()
+        nonlocal begin, clock, shown
+        begin, clock, shown = thread_time(), perf_counter(), False
         try:
             run(self)
         finally:
+            shown = True
             times.add(thread_time() - begin, perf_counter() - clock)
 
     asyncio.events.Handle._run = measured  # type: ignore[method-assign]
+    if stacks is None:
+        return
+    file = stacks.open("w")
 
+    def look(_: int, frame: FrameType | None) -> None:
+        # Python calls this in the loop's thread, between two steps of the callback. Once: writing takes time as well.
+        nonlocal shown
+        if not shown and (seconds := thread_time() - begin) > HELD_SECONDS:
+            shown = True
+            file.write(f"after {1e3 * seconds:.0f} ms, {1e3 * (perf_counter() - clock):.0f} ms by the clock:\n")
+            file.writelines(traceback.format_stack(frame))
+            file.flush()
 
-def watch_interpreter(path: Path) -> None:
-    """Write the stacks of all threads whenever none could run Python code for some time."""
-
-    def keep() -> None:
-        with path.open("w") as file:
-            while True:  # it is a thread without Python that writes, unless this one is in time
-                faulthandler.dump_traceback_later(HELD_SECONDS, file=file)
-                time.sleep(0.005)
-
-    threading.Thread(target=keep, daemon=True).start()
+    signal.signal(signal.SIGALRM, look)
+    signal.setitimer(signal.ITIMER_REAL, _LOOK_SECONDS, _LOOK_SECONDS)
 
 
 if __name__ == "__main__":
     sys.modules["uvloop"] = None  # type: ignore[assignment]
-    watch(LoopTimes(Path(sys.argv[2])))
-    if sys.argv[3:]:
-        watch_interpreter(Path(sys.argv[3]))
+    watch(LoopTimes(Path(sys.argv[2])), Path(sys.argv[3]) if sys.argv[3:] else None)
     serve(sys.argv[1], port=0)

@@ -4,6 +4,7 @@ import math
 from typing import Literal, NamedTuple
 
 from rayfix_service.fusion.diagnosis.residuals import Vector, signed_angle_residual
+from rayfix_service.fusion.measurements.calibrated import with_deviations
 from rayfix_service.fusion.measurements.report import Angle, Measurement, Range, Report
 from rayfix_service.fusion.posterior.fix import Fix
 from rayfix_tables.site import SiteInfo
@@ -21,7 +22,8 @@ class Residual(NamedTuple):
     outlier : bool
         Whether it is one with a probability above one half.
     differences : tuple of (quantity, value, stdev)
-        Measured minus that of the straight path to the position, and the stated deviation; empty where it says nothing.
+        Measured minus that of the straight path to the position, and the deviation that counts: the
+        stated one, or that which the station's calibration found. Empty where it says nothing.
     """
 
     station_id: str
@@ -33,6 +35,7 @@ class Residual(NamedTuple):
 def residuals(report: Report, fix: Fix, site: SiteInfo) -> tuple[Residual, ...]:
     """Compare the measurements of a report with the position of its fix."""
     position = None if fix.position is None else (*map(float, fix.position),)
+    report = with_deviations(report, site)
     found = []
     for measurement, outcome in zip(report.measurements, fix.outcomes, strict=True):
         outlier = outcome.used and (outcome.outlier_probability or 0.0) > 0.5

@@ -15,10 +15,10 @@ _SURE = 4.0
 """Standard errors of the mean that a bias must exceed, and ..."""
 
 _LARGE = 0.5
-"""... stated standard deviations."""
+"""... assumed standard deviations."""
 
 _FAR = 5.0
-"""Stated standard deviations beyond which a residual is of a reflected path, rather than of an error."""
+"""Assumed standard deviations beyond which a residual is of a reflected path, rather than of an error."""
 
 
 @dataclass
@@ -31,7 +31,7 @@ class Moments:
     stdevs: float = 0.0
 
     def add(self, value: float, stdev: float) -> None:
-        """Add a residual, and the deviation that was stated for it."""
+        """Add a residual, and the deviation that it is assumed to have."""
         self.count += 1
         self.total += value
         self.squares += value * value
@@ -48,15 +48,15 @@ class Moments:
         return math.sqrt(max(self.squares / self.count - self.mean**2, 0.0))
 
     @property
-    def stated(self) -> float:
-        """Mean of the deviations that were stated."""
+    def assumed(self) -> float:
+        """Mean of the deviations that they are assumed to have."""
         return self.stdevs / self.count
 
     @property
     def biased(self) -> bool:
         """Whether the mean is too large for chance."""
         error = max(self.deviation, 1e-9) / math.sqrt(self.count)
-        return self.count >= _LEAST and abs(self.mean) > max(_SURE * error, _LARGE * self.stated)
+        return self.count >= _LEAST and abs(self.mean) > max(_SURE * error, _LARGE * self.assumed)
 
 
 @dataclass
@@ -125,7 +125,7 @@ class Summary:
                             "count": moments.count,
                             "mean": moments.mean,
                             "deviation": moments.deviation,
-                            "stated": moments.stated,
+                            "assumed": moments.assumed,
                             "suspected_bias": moments.mean if moments.biased else None,
                         }
                         for quantity, moments in sorted(figures.residuals.items())

@@ -182,6 +182,7 @@ class Locator:
 
     def warm_up(self) -> None:
         """Compile the kernels and prepare reports without angles, by locating a report of each kind."""
+        _ = self.table.scene.free_space_in_table_frame.points_all_over
         stations = self.table.site.stations
         window = self.table.parts[stations[0].id].levels[0].window
         for station in stations:

@@ -6,6 +6,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+_NUM_ALL_OVER = 1000
+
 
 @dataclass(frozen=True, kw_only=True)
 class FreeSpace:
@@ -42,6 +44,24 @@ class FreeSpace:
             cov[i, i], cov[j, j] = share.sum(axis=1) @ x**2, share.sum(axis=0) @ y**2
         # Within a voxel it may be anywhere as well.
         return self.voxel_size * float(np.sqrt(np.linalg.eigvalsh(cov)[-1] + 1.0 / 12.0))
+
+    @cached_property
+    def points_all_over(self) -> NDArray[np.float64]:
+        """Centres of some free voxels, in even steps through all, for a position of which nothing is known.
+
+        An ndarray of shape (p, 3), m; p is 1000 to 2000, or the number of voxels if that is less.
+        """
+        counts = np.count_nonzero(self.free, axis=(1, 2))
+        ends = np.cumsum(counts)
+        ranks = np.arange(0, ends[-1], max(1, ends[-1] // _NUM_ALL_OVER))
+        layers = np.searchsorted(ends, ranks, side="right")
+        voxels = np.empty((len(ranks), 3))
+        voxels[:, 0] = layers
+        for i in np.unique(layers):  # one at a time: a list of all free voxels of a large site takes gigabytes
+            here = layers == i
+            free = np.flatnonzero(self.free[i])[ranks[here] - ends[i] + counts[i]]
+            voxels[here, 1], voxels[here, 2] = np.divmod(free, self.free.shape[2])
+        return self.origin + self.voxel_size * (voxels + 0.5)
 
     def moved(self, by: NDArray[np.float64]) -> "FreeSpace":
         """Return the map translated by a vector of shape (3,), m."""

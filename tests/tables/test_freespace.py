@@ -67,3 +67,14 @@ def test_the_largest_deviation_is_that_of_points_drawn_anywhere(seed: int) -> No
 def test_the_largest_deviation_of_a_long_hall() -> None:
     space = FreeSpace(origin=np.zeros(3), voxel_size=0.5, free=np.ones((40, 10, 6), bool))
     assert space.largest_stdev == pytest.approx(20.0 / np.sqrt(12.0), rel=1e-12)
+
+
+@pytest.mark.parametrize(("shape", "share"), [((7, 40, 30), 0.6), ((40, 7, 30), 0.01), ((3, 4, 5), 1.0)])
+def test_points_all_over_are_free_voxels_in_even_steps(shape: tuple[int, int, int], share: float) -> None:
+    free = np.random.default_rng(3).random(shape) <= share
+    free[2:] &= shape[0] < 40  # most layers without a voxel
+    space = FreeSpace(origin=np.array([1.0, -2.0, 0.5]), voxel_size=0.25, free=free)
+    every = np.argwhere(free)
+    step = max(1, len(every) // 1000)
+    np.testing.assert_allclose(space.points_all_over, space.origin + 0.25 * (every[::step] + 0.5))
+    assert len(space.points_all_over) >= min(len(every), 1000)

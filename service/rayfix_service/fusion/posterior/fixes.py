@@ -23,9 +23,6 @@ from rayfix_tables.table import Table
 _LEAST_CANDIDATE = 1e-3
 """Candidates less probable than this are left out of the fix."""
 
-_NUM_ANYWHERE = 1000
-"""Points that stand for a position of which nothing is known, about."""
-
 
 class Product(NamedTuple):
     """Posterior of a report, None where nothing could be used, and what it was made of.
@@ -104,7 +101,9 @@ def make_fix(report: Report, product: Product, table: Table, settings: FusionSet
             regions = CredibleRegions(
                 position=best.position,
                 covariance=best.covariance,
-                points=_anywhere(space) if _is_beyond(summary.moment[0], best.position, space) else summary.points,
+                points=ListedPoints(position=space.points_all_over)
+                if _is_beyond(summary.moment[0], best.position, space)
+                else summary.points,
                 share=share,
                 stretch=settings.inconsistent_stretch if status == "inconsistent" else 1.0,
             )
@@ -148,13 +147,6 @@ def _farthest(position: NDArray[np.float64], space: FreeSpace) -> NDArray[np.flo
     """Return the distances along x, y and z, m, to the farthest corner."""
     ends = np.stack([space.origin, space.origin + space.voxel_size * np.array(space.free.shape)])
     return np.asarray(np.abs(ends - position).max(axis=0))
-
-
-def _anywhere(space: FreeSpace) -> ListedPoints:
-    """Return points all over the free space, for a posterior that lies beyond the building."""
-    voxels = np.argwhere(space.free)
-    step = max(1, len(voxels) // _NUM_ANYWHERE)
-    return ListedPoints(position=space.origin + space.voxel_size * (voxels[::step] + 0.5))
 
 
 def _status(candidates: tuple[Candidate, ...], half_bad: float, anywhere: float, settings: FusionSettings) -> Status:
