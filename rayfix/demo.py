@@ -1,6 +1,7 @@
 """``rayfix demo``: builds, serves and locates in the bundled hall."""
 
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -28,6 +29,9 @@ _IDLE_SECONDS = 120.0
 """A service that is not ready counts as hung after this time without processor use or log output."""
 
 _ANSWER_SECONDS = 600.0
+
+_LOG_HEAD = re.compile(r"^(\S+Z )?[A-Z]+: *")
+"""Time and severity at the beginning of a line of the service's log."""
 
 
 def run_demo(folder: Path, *, jobs: int = -1) -> float:
@@ -169,7 +173,7 @@ def _show_kernels(log: Path, shown: int) -> int:
     whole = new[: new.rfind(b"\n") + 1]
     for line in whole.decode("utf-8", "replace").splitlines():
         if "kernels" in line:
-            print(f"   {line.partition(':')[2].strip()}", flush=True)
+            print(f"   {_LOG_HEAD.sub('', line)}", flush=True)
     return shown + len(whole)
 
 

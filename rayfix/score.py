@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -121,7 +121,7 @@ def read_fixes(path: Path) -> Iterator[Mapping[str, Any]]:
 
                 with path.open(encoding="utf-8") as file:
                     for line in file:
-                        yield flat(json.loads(line))
+                        yield flat(_fix_of(json.loads(line), path))
             case ".csv":
                 with path.open(encoding="utf-8", newline="") as file:
                     for row in csv.DictReader(file):
@@ -142,6 +142,14 @@ def read_fixes(path: Path) -> Iterator[Mapping[str, Any]]:
         raise ReportError(f"{path} cannot be read ({error.strerror or error}); give a file of fixes") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ReportError(f"{path} holds no fixes as 'rayfix locate -o' writes them ({error})") from error
+
+
+def _fix_of(document: Any, path: Path) -> Mapping[str, Any]:
+    if isinstance(document, Mapping) and "measurements" in document and "status" not in document:
+        raise ReportError(
+            f"{path} is a log of reports, not of fixes; locate it first: rayfix locate TABLE.h5 {path} -o FIXES.jsonl"
+        )
+    return cast("Mapping[str, Any]", document)
 
 
 def score_lines(score: Score) -> list[str]:

@@ -452,6 +452,8 @@ def _problem(error: Any) -> str:
         return f"{key} is missing: {_what_to_add(error['loc'])}"
     if error["type"] == "string_pattern_mismatch":
         return f"{key} = {error['input']!r}: give 1 to 64 letters, digits or . _ : -, a letter or digit first"
+    if error["type"] == "tuple_type":
+        return f"{key} = {error['input']!r}: give a list of numbers, as [7.0, 5.0, 2.5]"
     message = str(error["msg"]).removeprefix("Value error, ")
     if error["type"] == "value_error":
         return f"{key}: {message}" if key else message

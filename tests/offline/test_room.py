@@ -104,6 +104,7 @@ def test_sizes_in_centimetres_and_short_paths_are_said(tmp_path: Path) -> None:
         (None, None, "site.scene is missing"),
         ({"size_m": [1, 1, 1]}, "hall.glb", "give one of them"),
         ({"size_m": [1, 1, 0]}, None, "size_m"),
+        ({"size_m": "7x5"}, None, "room.size_m = '7x5': give a list of numbers"),
         ({"size_m": [1, 1, 1], "wall": "wood"}, None, "unknown key room.wall"),
     ],
 )

@@ -55,7 +55,8 @@ def test_the_demo_waits_for_a_service_that_works_and_shows_its_kernels(
 ) -> None:
     monkeypatch.setattr(demo, "_IDLE_SECONDS", 2.0)
     busy = (
-        "import time\nprint('WARNING:  compiling kernels, once', flush=True)\nend = time.monotonic() + 5.0\n"
+        "import time\nprint('2026-11-30T20:08:31.979Z WARNING:  compiling kernels, once', flush=True)\n"
+        "end = time.monotonic() + 5.0\n"
         "while time.monotonic() < end: pass\nprint('no table')\nraise SystemExit(2)"
     )
     with pytest.raises(RayfixError, match=r"ended with status 2; see its log \S+service.log: no table"):

@@ -90,6 +90,9 @@ def check(
         raise too_much((), f"{what} has more than {most} values; leave out what is not read")
     data = read_json(message) if isinstance(message, bytes) else message
     if isinstance(data, Mapping):
+        if isinstance(data.get("measurements"), list) and "measurements" not in model.model_fields:
+            text = "this is a report in rayfix's own format; leave out the format, or post it to /v1/positions"
+            raise InvalidReportError((FieldProblem(path=("measurements",), message=text),))
         data = dict(unwrap(data) if unwrap is not None else data)
         stations = data.get("stations")
         if isinstance(stations, Mapping) and len(stations) > limits.stations:

@@ -9,13 +9,14 @@ changes the process's environment; worker processes inherit the folder.
 
 numba compiles a kernel anew when its own file has changed. A kernel holds compiled copies of those that it calls, and
 after a change of one of these, as a checkout of another version is, old copies would run with new ones: this ended in
-wrong numbers or a crash. The call therefore forgets the kernels beside the modules when any file of the package, or of
-``rayfix_tables``, has changed.
+wrong numbers or a crash. The call therefore forgets the kernels beside the modules when any module with kernels has
+changed, or one that it imports from.
 """
 
 import hashlib
 import logging
 import os
+import re
 import stat
 import sys
 import tempfile
@@ -28,6 +29,7 @@ VARIABLE = "NUMBA_CACHE_DIR"
 
 _STAMP = "kernels.stamp"
 _TABLES = Path(__file__).parents[1]
+_IMPORTED = re.compile(rb"^\s*from (rayfix_[\w.]+) import", re.MULTILINE)
 
 _log = logging.getLogger("rayfix")
 
@@ -45,8 +47,8 @@ def ensure_kernel_cache(package: Path) -> None:
     RayfixError
         When no temporary folder is writable either.
     """
-    for folder, sources in ((_TABLES, (_TABLES,)), (package, (_TABLES, package))):
-        _forget_stale_kernels(folder, sources)
+    for folder in (_TABLES, package):
+        _forget_stale_kernels(folder)
     given = os.environ.get(VARIABLE)
     if any(
         _is_writable(folder) for folder in (given and Path(given), package / "__pycache__", _user_cache()) if folder
@@ -66,15 +68,16 @@ def ensure_kernel_cache(package: Path) -> None:
     )
 
 
-def _forget_stale_kernels(package: Path, sources: tuple[Path, ...]) -> None:
-    """Remove numba's indices beside the modules of a package if they are of other source files than there are now."""
+def _forget_stale_kernels(package: Path) -> None:
+    """Remove numba's indices beside the modules of a package if they are of other modules than there are now."""
     stamp = package / "__pycache__" / _STAMP
-    found = _stamp_of(sources)
     try:
+        found = _stamp_of(package)
         if stamp.exists() and stamp.read_bytes() == found:
             return
-        for index in package.rglob("__pycache__/*.nbi"):
-            index.unlink(missing_ok=True)  # another process may do the same
+        for folder in {path.parent for path in _modules(package)}:
+            for index in folder.glob("__pycache__/*.nbi"):
+                index.unlink(missing_ok=True)  # another process may do the same
         stamp.parent.mkdir(exist_ok=True)
         stamp.write_bytes(found)
     except OSError:
@@ -82,13 +85,25 @@ def _forget_stale_kernels(package: Path, sources: tuple[Path, ...]) -> None:
         return
 
 
-def _stamp_of(folders: tuple[Path, ...]) -> bytes:
-    """Return a digest of the names, sizes and times of all modules below some folders."""
+def _modules(package: Path) -> Iterator[Path]:
+    yield from package.glob("*.py")
+    for inner in package.iterdir():
+        if (inner / "__init__.py").is_file():
+            yield from _modules(inner)
+
+
+def _stamp_of(package: Path) -> bytes:
+    """Return a digest of the modules with kernels and of those that they import from: kernels hold their constants."""
+    texts = {path: path.read_bytes() for folder in {_TABLES, package} for path in _modules(folder)}
+    used = {path for path, text in texts.items() if b"numba" in text}
+    for names in [_IMPORTED.findall(texts[path]) for path in used]:
+        for name in names:
+            root, *inner = name.decode().split(".")
+            folder = _TABLES if root == _TABLES.name else package
+            used.add(folder.joinpath(*inner).with_suffix(".py"))
     digest = hashlib.sha256()
-    for folder in folders:
-        for path in sorted(folder.rglob("*.py")):
-            found = path.stat()
-            digest.update(f"{path.relative_to(folder)} {found.st_size} {found.st_mtime_ns}\n".encode())
+    for path in sorted(used & texts.keys()):
+        digest.update(path.name.encode() + hashlib.sha256(texts[path]).digest())
     return digest.hexdigest().encode()
 
 

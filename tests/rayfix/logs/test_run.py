@@ -2,8 +2,10 @@
 
 import csv
 import json
+import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +16,14 @@ from rayfix.cli import main
 from rayfix.logs.entries import Task
 from rayfix.logs.layouts import FIX_COLUMNS, Layout
 from rayfix.logs.reading import Reading
+from rayfix.logs.residuals import residuals
 from rayfix.logs.run import LogRun, locate_logs
+from rayfix.score import score_fixes
 from rayfix_evaluation.truth.forward import ForwardSolver
 from rayfix_service.locator import Locator
+from rayfix_service.wire import parse_report
 from rayfix_tables.errors import ReportError
+from rayfix_tables.site import Deviations
 from rayfix_tables.table import Table
 
 COUNT = 150
@@ -225,3 +231,24 @@ def test_the_process_that_reads_and_writes_needs_no_compiler() -> None:
     code = "import sys, rayfix.commands.locating, rayfix.logs.run, rayfix.console_logs; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_a_log_that_was_not_located_has_no_score(tmp_path: Path, log: Path) -> None:
+    truth = tmp_path / "truth.csv"
+    truth.write_text("timestamp,target_id,x_m,y_m,z_m\n2026-01-01T00:00:00Z,,1,1,1\n", encoding="utf-8")
+    with pytest.raises(ReportError, match="log of reports, not of fixes; locate it first: rayfix locate"):
+        score_fixes(log, truth)
+
+
+def test_residuals_stand_beside_the_deviations_that_count(table: Table, log: Path) -> None:
+    """They stood beside the stated ones, and residuals beyond five of these were left out of the means."""
+    report = parse_report(log.read_bytes().splitlines()[0])
+    fix = Locator(table).locate(report)
+    deviations = Deviations(azimuth=math.radians(7.0), tail_share=0.1, tail_scale=3.0)
+    stations = [replace(station, deviations=deviations) for station in table.site.stations]
+    calibrated = replace(table.site, stations=stations)
+    for site, azimuth, zenith in ((table.site, 2.0, 2.0), (calibrated, 7.0, 2.0)):
+        for residual in residuals(report, fix, site):
+            assert {name: stdev for name, _, stdev in residual.differences} == pytest.approx(
+                {"azimuth_deg": azimuth, "zenith_deg": zenith}
+            )

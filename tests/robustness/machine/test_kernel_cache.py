@@ -165,25 +165,28 @@ def test_a_name_that_others_have_taken_is_not_used(run: Run, tmp_path: Path, kin
     assert not list(tmp_path.rglob("theirs/*"))
 
 
-@pytest.mark.parametrize("changed", ["callee", "caller", "other"])
-def test_kernels_of_a_former_version_are_forgotten(tmp_path: Path, changed: str) -> None:
+@pytest.mark.parametrize(("changed", "expected"), [("callee", 30.0), ("constant", 21.0), ("other", 3.0)])
+def test_kernels_of_a_former_version_are_forgotten(tmp_path: Path, changed: str, expected: float) -> None:
     """Numba compared the caller's own file only, and ran its old copy of the callee: wrong numbers, or a crash."""
-    package = tmp_path / "made"
+    package = tmp_path / "rayfix_made"
     (package / "inner").mkdir(parents=True)
-    source = {
-        "callee": "import numba\n\n@numba.njit(cache=True)\ndef one(x):\n    return x + 1.0\n",
-        "caller": "import numba\nfrom made.inner.callee import one\n\n@numba.njit(cache=True)\ndef two(x):\n"
-        "    return one(x) + 1.0\n",
-        "other": "",
-    }
+    (package / "inner" / "__init__.py").touch()
     head = "from pathlib import Path\nfrom rayfix_tables.gaussians.kernel_cache import ensure_kernel_cache\n"
     (package / "__init__.py").write_text(f"{head}ensure_kernel_cache(Path(__file__).parent)\n")
-    for name, text in source.items():
+    kernel = "import numba\n{}\n\n@numba.njit(cache=True)\ndef {}(x):\n    return {}\n"
+    caller = "from rayfix_made.inner.callee import one\nfrom rayfix_made.inner.constant import SCALE"
+    texts = {
+        "callee": kernel.format("", "one", "x + 2.0"),
+        "caller": kernel.format(caller, "two", "SCALE * one(x)"),
+        "constant": "SCALE = 1.0\n",
+        "other": "UNUSED = 1.0\n",
+    }
+    for name, text in texts.items():
         (package / "inner" / f"{name}.py").write_text(text)
 
     def value() -> tuple[float, int]:
         """Return what the kernel gives, and how many were taken from the cache."""
-        script = "from made.inner.caller import two\nprint(two(1.0), sum(two.stats.cache_hits.values()))"
+        script = "from rayfix_made.inner.caller import two\nprint(two(1.0), sum(two.stats.cache_hits.values()))"
         environment = {name: text for name, text in os.environ.items() if not name.startswith("NUMBA_")}
         done = subprocess.run(
             [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
@@ -193,8 +196,7 @@ def test_kernels_of_a_former_version_are_forgotten(tmp_path: Path, changed: str)
 
     assert value() == (3.0, 0)
     assert value() == (3.0, 1)
-    text = source[changed]
-    (package / "inner" / f"{changed}.py").write_text(text.replace("+ 1.0", "+ 10.0") or "added = True\n")
-    expected = 3.0 if changed == "other" else 12.0
-    assert value() == (expected, 0)
+    text = texts[changed].replace("1.0", "7.0").replace("2.0", "29.0")
+    (package / "inner" / f"{changed}.py").write_text(text)
+    assert value() == (expected, int(changed == "other"))
     assert value() == (expected, 1)

@@ -2,12 +2,13 @@
 
 import json
 import math
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rayfix_service.adapters.formats import parse
 from rayfix_service.adapters.silabs import parse_silabs, parse_silabs_angle
 from rayfix_service.fusion.measurements.report import Angle, Height, Range
 from rayfix_service.wire import InvalidReportError, MalformedJsonError
@@ -125,3 +126,10 @@ def test_a_payload_of_mqtt():
         parse_silabs_angle(b"not JSON")
     with pytest.raises(InvalidReportError, match="the angle is 5; give a JSON object"):
         parse_silabs_angle(b"5")
+
+
+@pytest.mark.parametrize("input_format", ["nrppa", "silabs"])
+def test_a_report_in_the_format_of_rayfix_is_recognised(input_format: Literal["nrppa", "silabs"]):
+    body = b'{"measurements": [{"type": "pt", "station_id": "a", "range_m": 7.0, "stdev_m": 1.0}]}'
+    with pytest.raises(InvalidReportError, match="rayfix's own format; leave out the format"):
+        parse(body, input_format)

@@ -11,7 +11,7 @@ from rayfix_service.http.answering.cooperative import Cooperation
 from rayfix_service.http.answering.locating import Answerer, Incoming
 from rayfix_service.http.answering.response_options import ResponseOptions
 from rayfix_service.http.answering.served_tables import ServedTable
-from rayfix_service.http.routes.json_answer import JsonAnswer, results_answer, write_json
+from rayfix_service.http.routes.json_answer import ResultsAnswer, write_json
 from rayfix_service.http.routes.one_report import ReadOne
 from rayfix_service.http.telemetry.report_figures import Source
 from rayfix_service.wire import MalformedJsonError
@@ -26,7 +26,7 @@ async def answer_batch(
     options: ResponseOptions,
     read_one: ReadOne,
     source: Source,
-) -> JsonAnswer:
+) -> ResultsAnswer:
     """Read all reports of a batch, then locate them in their order.
 
     Raises
@@ -64,7 +64,7 @@ async def answer_batch(
             results.append(write_json(answer))
         else:
             results.append(write_json(report))
-    return results_answer(results)
+    return ResultsAnswer(results)
 
 
 def _itself(report: Incoming) -> Incoming:

@@ -39,7 +39,7 @@ from rayfix_service.http.routes.dependencies import (
     ReportBody,
     TableDep,
 )
-from rayfix_service.http.routes.json_answer import JsonAnswer, results_answer, write_json
+from rayfix_service.http.routes.json_answer import JsonAnswer, ResultsAnswer, write_json
 from rayfix_service.http.routes.one_report import answer_one
 from rayfix_service.wire.limits import MessageLimits
 
@@ -91,7 +91,7 @@ async def post_silabs(
 )
 async def post_nrppa_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: MessageOptionsDep
-) -> JsonAnswer:
+) -> ResultsAnswer:
     """Locate each message on its own; one that cannot be used gets a problem and leaves the others alone."""
     return await answer_batch(request, answerer, table, body, options, _read_nrppa, "nrppa_batch")
 
@@ -105,7 +105,7 @@ async def post_nrppa_batch(
 )
 async def post_silabs_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: MessageOptionsDep
-) -> JsonAnswer:
+) -> ResultsAnswer:
     """Locate each packet on its own; one that cannot be used gets a problem and leaves the others alone."""
     return await answer_batch(request, answerer, table, body, options, _read_silabs, "silabs_batch")
 
@@ -152,7 +152,7 @@ async def post_ublox(
     tail_scale: Annotated[
         float, Query(ge=1, le=100, description="standard deviation of the wider Gaussian, in those of the other")
     ] = USUAL_ERRORS.tail_scale,
-) -> JsonAnswer:
+) -> ResultsAnswer:
     """Take ``+UUDF`` lines of u-blox anchors, join them by tag and sequence number, and locate each transmission.
 
     Lines without a log's time are taken for lines that end now.
@@ -174,4 +174,4 @@ async def post_ublox(
         await cooperation.let_others_run()
         answer = await answerer.answer_or_problem(table, partial(foreign, adapted), options, "ublox")
         results.append(write_json(answer))
-    return results_answer(results)
+    return ResultsAnswer(results)

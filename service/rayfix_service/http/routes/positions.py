@@ -21,7 +21,7 @@ from rayfix_service.http.routes.dependencies import (
     TableDep,
     read_body,
 )
-from rayfix_service.http.routes.json_answer import JsonAnswer, write_json
+from rayfix_service.http.routes.json_answer import JsonAnswer, ResultsAnswer, write_json
 from rayfix_service.http.routes.one_report import answer_one
 from rayfix_service.http.services import services_in
 from rayfix_service.wire import BatchDocument, ReportDocument
@@ -84,6 +84,6 @@ async def answer_position(state: State, scope: Scope, receive: Receive) -> tuple
 )
 async def post_batch(
     request: Request, answerer: AnswererDep, table: TableDep, body: BatchBody, options: ResponseOptionsDep
-) -> JsonAnswer:
+) -> ResultsAnswer:
     """Locate each report on its own; one that cannot be used gets a problem and leaves the others alone."""
     return await answer_batch(request, answerer, table, body, options, native, "batch")
