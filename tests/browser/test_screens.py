@@ -21,6 +21,9 @@ HEADER = """() => [...document.querySelectorAll("#bar button, #bar a, #bar nav, 
     .map((one) => one.getBoundingClientRect()).filter((box) => box.width > 0)
     .map(({ left, right, top, bottom }) => [left, right, top, bottom])"""
 
+BOXES = """elements => elements.map((one) => one.getBoundingClientRect())
+    .map(({ left, right, top, bottom }) => [left, right, top, bottom])"""
+
 PIXEL = """p => {
     const { stage } = rayfixViewer;
     const v = stage.local(p).project(stage.camera);
@@ -57,6 +60,9 @@ def test_all_of_the_header_is_on_the_screen(
             # A tab is within the group of the tabs, and beside the other one.
             within = left <= other[0] and other[1] <= right and top <= other[2] and other[3] <= bottom
             assert apart or within or not inside, (boxes[n], other)
+    stations = page.eval_on_selector_all(".label.station:not([hidden])", BOXES)
+    assert len(stations) == 4
+    assert all(left >= 0 and right <= width for left, right, _, _ in stations), stations
     if width == 390:
         page.locator("#open-right").click()
         page.wait_for_timeout(500)

@@ -8,6 +8,8 @@ export interface Label {
   visible: boolean;
 }
 
+const NEAR = 200; // pixels: only there are labels measured, which takes time
+
 export class Labels {
   private readonly labels = new Set<Label>();
   private readonly projected = new Vector3();
@@ -29,13 +31,18 @@ export class Labels {
     this.labels.delete(label);
   }
 
-  place(camera: Camera, width: number, height: number): void {
+  /** Put the words at their places, and to the left of those that are near the end of the visible part. */
+  place(camera: Camera, width: number, height: number, end: number): void {
     for (const label of this.labels) {
       const p = this.projected.copy(label.position).project(camera);
       const shown = label.visible && p.z < 1 && p.z > -1 && Math.abs(p.x) < 1.1 && Math.abs(p.y) < 1.1;
       label.element.hidden = !shown;
       if (!shown) continue;
-      const x = ((p.x + 1) / 2) * width;
+      let x = ((p.x + 1) / 2) * width;
+      if (x < end && x > end - NEAR) {
+        const { offsetWidth, offsetLeft } = label.element;
+        if (x + offsetLeft + offsetWidth > end) x -= offsetWidth + 2 * offsetLeft;
+      }
       const y = ((1 - p.y) / 2) * height;
       label.element.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
     }

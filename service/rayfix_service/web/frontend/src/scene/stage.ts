@@ -152,7 +152,8 @@ export class Stage {
   private draw(): void {
     for (const task of this.beforeFrame) task();
     this.renderer.render(this.scene, this.camera);
-    this.labels.place(this.camera, this.size.width, this.size.height);
+    const { width, height } = this.size;
+    this.labels.place(this.camera, width, height, width - this.insets.right);
   }
 
   private measure(duration: number): void {
