@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, settings
 
 from rayfix.example.files import write_example
 from rayfix_offline.build import build_table
+from rayfix_tables.gaussians.compilation import watch_compilation
 from tests.support.checkout import SHARED
 
 # A shared machine may stall for longer than an example may take by default.
@@ -18,6 +19,9 @@ settings.register_profile(
     "shared machine", parent=settings.default, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("shared machine")
+
+# Several processes run the tests, and compile kernels at their first calls.
+watch_compilation()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -35,7 +35,9 @@ class RunningService:
 
     def __init__(self, command: list[str]) -> None:
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115
-        self.process = subprocess.Popen([sys.executable, *command], stdout=self._log, stderr=self._log)
+        self.process = subprocess.Popen(
+            [sys.executable, "-X", "faulthandler", *command], stdout=self._log, stderr=self._log
+        )
         self.url = ""
 
     @property

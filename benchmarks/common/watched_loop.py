@@ -6,6 +6,7 @@ them. With a third argument, a file, it writes there what callbacks do after :da
 """
 
 import asyncio.events
+import gc
 import mmap
 import signal
 import sys
@@ -81,6 +82,16 @@ def watch(times: LoopTimes, stacks: Path | None = None) -> None:
             file.writelines(traceback.format_stack(frame))
             file.flush()
 
+    def collected(phase: str, found: dict[str, int]) -> None:
+        # Python finds no time to call the above while it collects.
+        if phase == "start":
+            started[0] = thread_time()
+        elif (seconds := thread_time() - started[0]) > HELD_SECONDS / 4.0:
+            file.write(f"a collection of generation {found['generation']} took {1e3 * seconds:.0f} ms\n")
+            file.flush()
+
+    started = [0.0]
+    gc.callbacks.append(collected)
     signal.signal(signal.SIGALRM, look)
     signal.setitimer(signal.ITIMER_REAL, _LOOK_SECONDS, _LOOK_SECONDS)
 

@@ -186,6 +186,8 @@ def main() -> None:
                 ]
             for each in sending:
                 each.result()
+            if service.process.poll() is not None:
+                sys.exit(f"the service ended with {service.process.returncode}:\n{service.log()}")
             time.sleep(options.rest)
             memory.append(resident_mebibytes(pid))
             done = sum(found.statuses.values())

@@ -23,7 +23,7 @@ from rayfix_service.fusion.settings import FusionSettings
 from rayfix_service.fusion.stopping import NEVER, Stop
 from rayfix_service.wire import parse_report
 from rayfix_tables.errors import ReportError
-from rayfix_tables.gaussians.compilation import announce_compilation
+from rayfix_tables.gaussians.compilation import watch_compilation
 from rayfix_tables.table import Table
 
 
@@ -48,7 +48,7 @@ class Locator:
     def __init__(self, table: Table, settings: FusionSettings | None = None) -> None:
         if not isinstance(table, Table):
             raise TypeError(f"a Locator needs an open table, not {table!r}; open the file with rayfix.Table.open(path)")
-        announce_compilation()
+        watch_compilation()
         self.table = table
         self.settings = settings or FusionSettings()
         self._fusion = Fusion(table, self.settings)

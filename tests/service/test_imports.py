@@ -23,7 +23,7 @@ import importlib, pkgutil
 for root in {roots!r}:
     package = importlib.import_module(root)
     names = [m.name for m in pkgutil.walk_packages(package.__path__, root + ".")]
-    compiled = ("cholesky", "compilation", "conditioning", "expanding", "tree_reduction", "triangles")
+    compiled = ("cholesky", "compilation", "conditioning", "expanding", "kernel_lock", "tree_reduction", "triangles")
     names = [name for name in names if name.rpartition(".")[2] not in ("__main__", *compiled)]
     for name in names:
         importlib.import_module(name)

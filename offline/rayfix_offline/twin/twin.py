@@ -33,7 +33,7 @@ from rayfix_offline.twin.solids import map_free_space, sealed_space, solid_faces
 from rayfix_offline.twin.surfaces import join_facets
 from rayfix_tables.errors import SceneError
 from rayfix_tables.freespace import FreeSpace
-from rayfix_tables.gaussians.compilation import announce_compilation
+from rayfix_tables.gaussians.compilation import watch_compilation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ def prepare_twin(site: SiteFile, folder: Path, settings: TwinSettings | None = N
 
 def prepare_scene(site: SiteFile, scene: Scene, settings: TwinSettings | None = None) -> Twin:
     """Prepare the twin of a scene that is already loaded; see :func:`prepare_twin`."""
-    announce_compilation()
+    watch_compilation()
     settings = settings or TwinSettings()
     origin = table_origin(scene)
     site, scene = site.moved(-origin), scene.moved(-origin)

@@ -9,6 +9,8 @@ import time
 
 from numba.core import event
 
+from rayfix_tables.gaussians.kernel_lock import kernel_lock
+
 _AGAIN_SECONDS = 10.0
 """Time between two messages."""
 
@@ -54,9 +56,10 @@ _announcer = _Announcer()
 _registered = False
 
 
-def announce_compilation() -> None:
-    """Announce compilations of rayfix's kernels from now on."""
+def watch_compilation() -> None:
+    """Announce compilations of rayfix's kernels from now on, and have processes compile one after the other."""
     global _registered
     if not _registered:
         _registered = True
         event.register("numba:compile", _announcer)
+        event.register("numba:compiler_lock", kernel_lock())

@@ -69,15 +69,16 @@ def ensure_kernel_cache(package: Path) -> None:
 
 
 def _forget_stale_kernels(package: Path) -> None:
-    """Remove numba's indices beside the modules of a package if they are of other modules than there are now."""
+    """Remove numba's files beside the modules of a package if they are of other modules than there are now."""
     stamp = package / "__pycache__" / _STAMP
     try:
         found = _stamp_of(package)
         if stamp.exists() and stamp.read_bytes() == found:
             return
         for folder in {path.parent for path in _modules(package)}:
-            for index in folder.glob("__pycache__/*.nbi"):
-                index.unlink(missing_ok=True)  # another process may do the same
+            for pattern in ("*.nbi", "*.nbc"):  # the index first: what it names must be there
+                for path in folder.glob(f"__pycache__/{pattern}"):
+                    path.unlink(missing_ok=True)  # another process may do the same
         stamp.parent.mkdir(exist_ok=True)
         stamp.write_bytes(found)
     except OSError:

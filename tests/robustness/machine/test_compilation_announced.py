@@ -9,10 +9,10 @@ SCRIPT = """
 import numba
 import numpy as np
 from rayfix_service.fusion.posterior.principal_axes import semi_axes
-from rayfix_tables.gaussians.compilation import announce_compilation
+from rayfix_tables.gaussians.compilation import watch_compilation
 
-announce_compilation()
-announce_compilation()
+watch_compilation()
+watch_compilation()
 numba.njit(lambda x: x + 1.0)(1.0)
 print("own")
 semi_axes(np.eye(3))
