@@ -54,7 +54,7 @@ def unite_maxima(
     for b in range(1, count):
         for a in range(b - 1, -1, -1):
             if stop[0] != 0:
-                return first
+                break
             if _root(first, a) == _root(first, b):
                 continue
             if (
