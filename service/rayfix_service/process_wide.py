@@ -11,9 +11,9 @@ What stays is a listener to numba's compilations, which announces those of rayfi
 
 ``rayfix mqtt`` logs to standard error by :func:`logged_to_stderr`. ``rayfix serve`` has uvicorn configure logging
 (:func:`logging_restored` undoes it), takes signals (``rayfix_service.server.stopping``, ``workers``), sets the variable
-of prometheus_client for its workers, and freezes the collector's objects (``gc.freeze``) while they run: all of it is
-undone at its end. So is that threads share one arena of glibc (``http.answering.freed_memory``). Only the limit of
-open files stays raised. It ends by an exception, never by leaving the process.
+of prometheus_client for its workers, freezes the collector's objects (``gc.freeze``) and sets its thresholds while they
+run: all of it is undone at its end. So is that threads share one arena of glibc (``http.answering.freed_memory``). Only
+the limit of open files stays raised. It ends by an exception, never by leaving the process.
 """
 
 import gc

@@ -1,7 +1,6 @@
 """The web application."""
 
 import asyncio
-import gc
 import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -42,7 +41,8 @@ from rayfix_service.http.services import Services, set_services
 from rayfix_service.http.settings import ServiceSettings
 from rayfix_service.http.telemetry.connections import NOTE
 from rayfix_service.http.telemetry.metrics import Metrics, forget_dead_workers
-from rayfix_service.http.telemetry.request_context import HEADER, RequestContext
+from rayfix_service.http.telemetry.request_context import HEADER, RequestContext, UnderWay
+from rayfix_service.server.collection import collect_while_idle
 from rayfix_service.server.fast_path import FastPath
 from rayfix_service.server.stopping import on_stop_signal
 from rayfix_service.web import routes_assets, routes_scene, routes_simulation
@@ -143,7 +143,7 @@ def create_app(
     """
     settings = settings or ServiceSettings()
     keys = None if settings.api_keys is None else ApiKeys(settings.api_keys)
-    metrics = Metrics()
+    metrics, under_way = Metrics(), UnderWay()
     feed = FixFeed(settings.feed_limits)
 
     @asynccontextmanager
@@ -159,7 +159,7 @@ def create_app(
         if keys is not None:
             keeping.append(asyncio.create_task(_keep_keys(keys, settings.watch_seconds)))
         if settings.own_process:
-            keeping.append(asyncio.create_task(_freeze(tables)))
+            keeping.append(asyncio.create_task(_collect(tables, under_way)))
         relay = None
         if settings.runtime_folder is not None:
             relay = FeedRelay(feed, settings.runtime_folder)
@@ -251,7 +251,7 @@ def create_app(
         Edge, hosts=settings.hosts, origins=tuple(settings.cors_origins), asks_for_keys=settings.api_keys is not None
     )
     app.surround(Prefix, root_path=settings.root_path, trusts_header=settings.trust_forwarded_prefix)
-    app.surround(RequestContext, metrics=metrics)
+    app.surround(RequestContext, metrics=metrics, under_way=under_way)
     app.include_router(positions.router)
     app.include_router(formats.router)
     app.include_router(stream.router)
@@ -324,11 +324,10 @@ async def _prepare_requests(app: FastAPI) -> None:
     await Request(scope, receive).is_disconnected()
 
 
-async def _freeze(tables: Tables) -> None:
-    """Exempt all objects from garbage collection once the process is ready."""
+async def _collect(tables: Tables, under_way: UnderWay) -> None:
+    """Collect reference cycles in idle moments, once the process is ready."""
     await tables.became_ready.wait()
-    gc.collect()
-    gc.freeze()
+    await collect_while_idle(under_way)
 
 
 async def _take_turn(tables: Tables, marker: Path, stopping: asyncio.Event) -> None:

@@ -151,6 +151,7 @@ def serve(
         gc.collect()  # while nobody waits for an answer
         gc.freeze()  # a collection would write to the workers' shared memory and thus copy it
         stack.callback(gc.unfreeze)
+        stack.callback(gc.set_threshold, *gc.get_threshold())  # the app changes it
         if workers == 1:
             with suppress(KeyboardInterrupt):
                 _run(config)

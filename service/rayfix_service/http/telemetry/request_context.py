@@ -31,6 +31,13 @@ _log = logging.getLogger(__name__)
 _PROPER = re.compile(r"[A-Za-z0-9._:/+=-]{1,128}")
 
 
+class UnderWay:
+    """How many POST requests are under way; others may be streams without an end."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+
 class RequestContext:
     """Middleware around all others.
 
@@ -40,9 +47,10 @@ class RequestContext:
     server would log them a second time.
     """
 
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, metrics: Metrics, under_way: UnderWay) -> None:
         self._app = app
         self._metrics = metrics
+        self._under_way = under_way
         self._numbers = count()
         self._prefix = token_hex(10)  # of this process: a random number for each request costs a system call
 
@@ -68,6 +76,8 @@ class RequestContext:
 
         token = REQUEST_ID.set(identifier)
         start = perf_counter()
+        is_post = scope["method"] == "POST"
+        self._under_way.count += is_post
         try:
             await self._app(scope, receive, send_noting)
         except asyncio.CancelledError:  # not a defect: the process ends, or the client's key was removed
@@ -82,6 +92,7 @@ class RequestContext:
             if not status:
                 await problem_response(internal_problem())(scope, receive, send_noting)
         finally:
+            self._under_way.count -= is_post
             self._note(scope, scope["method"], str(status or "none"), perf_counter() - start, identifier)
             REQUEST_ID.reset(token)
 

@@ -30,7 +30,7 @@ from rayfix_service.http.problems import NOT_FOUND, OVERLOADED, ProblemError
 from rayfix_service.http.telemetry.logs import JsonFormatter, log_config
 from rayfix_service.http.telemetry.metrics import Metrics
 from rayfix_service.http.telemetry.report_figures import report_outcome
-from rayfix_service.http.telemetry.request_context import ACCESS_LOGGER, REQUEST_ID, RequestContext
+from rayfix_service.http.telemetry.request_context import ACCESS_LOGGER, REQUEST_ID, RequestContext, UnderWay
 from rayfix_service.http.telemetry.station_figures import MOST_STATIONS
 from rayfix_service.locator import Locator
 from rayfix_tables.disk.schema import FORMAT_VERSION
@@ -344,7 +344,7 @@ def test_a_defect_after_an_answer_has_begun(sent: int, raised: bool, caplog: pyt
     async def send(message: Any) -> None:
         received.append(message["type"])
 
-    context = RequestContext(fail, metrics=Metrics())
+    context = RequestContext(fail, metrics=Metrics(), under_way=UnderWay())
     with pytest.raises(RuntimeError) if raised else contextlib.nullcontext():
         asyncio.run(context(scope, receive, send))
     assert received == [message["type"] for message in answer[:sent]]
