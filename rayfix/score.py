@@ -125,7 +125,7 @@ def read_fixes(path: Path) -> Iterator[Mapping[str, Any]]:
             case ".csv":
                 with path.open(encoding="utf-8", newline="") as file:
                     for row in csv.DictReader(file):
-                        yield {name: value or None for name, value in row.items()}
+                        yield {name: value or None for name, value in _fix_of(row, path).items()}
             case ".geojson":
                 for feature in json.loads(path.read_text(encoding="utf-8"))["features"]:
                     yield feature["properties"]
@@ -145,7 +145,7 @@ def read_fixes(path: Path) -> Iterator[Mapping[str, Any]]:
 
 
 def _fix_of(document: Any, path: Path) -> Mapping[str, Any]:
-    if isinstance(document, Mapping) and "measurements" in document and "status" not in document:
+    if isinstance(document, Mapping) and "status" not in document and {"measurements", "type"} & document.keys():
         raise ReportError(
             f"{path} is a log of reports, not of fixes; locate it first: rayfix locate TABLE.h5 {path} -o FIXES.jsonl"
         )

@@ -6,8 +6,8 @@ Functions of the public API change nothing in their process that outlasts the ca
 - the threads of linear algebra libraries, by threadpoolctl's context manager, in fits and evaluations;
 - the logging of libraries that read scenes, in ``rayfix_offline.scene``.
 
-What stays is a listener to numba's compilations, which announces those of rayfix's own kernels on the log
-(``rayfix_tables.gaussians.compilation``).
+What stays is a listener to numba's compilations, which announces those of rayfix's own kernels on the log, and has
+processes compile one after the other (``rayfix_tables.gaussians.compilation``).
 
 ``rayfix mqtt`` logs to standard error by :func:`logged_to_stderr`. ``rayfix serve`` has uvicorn configure logging
 (:func:`logging_restored` undoes it), takes signals (``rayfix_service.server.stopping``, ``workers``), sets the variable

@@ -236,8 +236,11 @@ def test_the_process_that_reads_and_writes_needs_no_compiler() -> None:
 def test_a_log_that_was_not_located_has_no_score(tmp_path: Path, log: Path) -> None:
     truth = tmp_path / "truth.csv"
     truth.write_text("timestamp,target_id,x_m,y_m,z_m\n2026-01-01T00:00:00Z,,1,1,1\n", encoding="utf-8")
-    with pytest.raises(ReportError, match="log of reports, not of fixes; locate it first: rayfix locate"):
-        score_fixes(log, truth)
+    rows = tmp_path / "log.csv"
+    rows.write_text("timestamp,type,station_id,range_m,stdev_m\n2026-01-01T00:00:00Z,pt,bs1,7,1\n", encoding="utf-8")
+    for path in (log, rows):
+        with pytest.raises(ReportError, match="log of reports, not of fixes; locate it first: rayfix locate"):
+            score_fixes(path, truth)
 
 
 def test_residuals_stand_beside_the_deviations_that_count(table: Table, log: Path) -> None:
