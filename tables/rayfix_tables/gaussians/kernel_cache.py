@@ -49,12 +49,9 @@ def ensure_kernel_cache(package: Path) -> None:
     """
     for folder in (_TABLES, package):
         _forget_stale_kernels(folder)
-    given = os.environ.get(VARIABLE)
-    if any(
-        _is_writable(folder) for folder in (given and Path(given), package / "__pycache__", _user_cache()) if folder
-    ):
+    if any(map(_is_writable, kernel_folders(package))):
         return
-    folder = _temporary_folder()
+    given, folder = os.environ.get(VARIABLE), _temporary_folder()
     os.environ[VARIABLE] = str(folder)
     if "numba" in sys.modules:
         # numba read the environment at its import.
@@ -66,6 +63,13 @@ def ensure_kernel_cache(package: Path) -> None:
         given or package,
         VARIABLE,
     )
+
+
+def kernel_folders(package: Path) -> tuple[Path, ...]:
+    """Return the folders that numba would keep a package's kernels in, the first that can be written to."""
+    given = os.environ.get(VARIABLE)
+    named = (given and Path(given), package / "__pycache__", _user_cache())
+    return tuple(folder for folder in named if folder)
 
 
 def _forget_stale_kernels(package: Path) -> None:

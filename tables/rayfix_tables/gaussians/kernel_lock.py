@@ -14,7 +14,7 @@ from pathlib import Path
 
 from numba.core import event
 
-from rayfix_tables.gaussians.kernel_cache import VARIABLE
+from rayfix_tables.gaussians.kernel_cache import kernel_folders
 
 _NAME = "kernels.lock"
 
@@ -24,12 +24,12 @@ class KernelLock(event.Listener):  # type: ignore[misc]
 
     Parameters
     ----------
-    folder : pathlib.Path
-        Where the file is. Where it cannot be written or locked, processes do not wait for each other.
+    folders : pathlib.Path
+        The file is in the first where it can be written. Where it can in none, processes do not wait for each other.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / _NAME
+    def __init__(self, *folders: Path) -> None:
+        self._paths = [folder / _NAME for folder in folders]
         self._lock = threading.Lock()
         self._file: int | None = None
         self._own = threading.local()
@@ -42,9 +42,10 @@ class KernelLock(event.Listener):  # type: ignore[misc]
         self._lock.acquire()
         try:
             # Opened anew each time: processes that are forked would share the lock of an open file.
-            with contextlib.suppress(OSError):
-                self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-                fcntl.flock(self._file, fcntl.LOCK_EX)
+            self._file = next((file for file in map(_opened, self._paths) if file is not None), None)
+            if self._file is not None:
+                with contextlib.suppress(OSError):  # a file system without locks
+                    fcntl.flock(self._file, fcntl.LOCK_EX)
         except BaseException:  # interrupted
             self.on_end(event)
             raise
@@ -61,7 +62,13 @@ class KernelLock(event.Listener):  # type: ignore[misc]
         self._lock.release()
 
 
+def _opened(path: Path) -> int | None:
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError:
+        return None
+
+
 def kernel_lock() -> KernelLock:
-    """Return the lock in the folder of the compiled kernels."""
-    given = os.environ.get(VARIABLE)
-    return KernelLock(Path(given) if given else Path(__file__).parent / "__pycache__")
+    """Return the lock of the folder that numba keeps compiled kernels in."""
+    return KernelLock(*kernel_folders(Path(__file__).parent))

@@ -100,3 +100,11 @@ def test_where_there_can_be_no_lock_nobody_waits(tmp_path: Path) -> None:
     lock = KernelLock(tmp_path / "none")
     lock.on_start(EVENT)
     lock.on_end(EVENT)
+
+
+def test_the_lock_is_in_the_first_folder_that_can_be_written_to(tmp_path: Path) -> None:
+    lock = KernelLock(tmp_path / "none", tmp_path)
+    lock.on_start(EVENT)
+    assert is_held(tmp_path)
+    lock.on_end(EVENT)
+    assert not is_held(tmp_path)
