@@ -158,8 +158,6 @@ def create_app(
         keeping = [asyncio.create_task(tables.keep(settings.watch_seconds))]
         if keys is not None:
             keeping.append(asyncio.create_task(_keep_keys(keys, settings.watch_seconds)))
-        if settings.own_process:
-            keeping.append(asyncio.create_task(_collect(tables, under_way)))
         relay = None
         if settings.runtime_folder is not None:
             relay = FeedRelay(feed, settings.runtime_folder)
@@ -210,6 +208,8 @@ def create_app(
                         forget_dead_workers()
                         await _take_turn(tables, settings.runtime_folder / "ready", stopping)
                     await _prepare_requests(app)
+                    if settings.own_process:  # now that what lasts has been made
+                        keeping.append(asyncio.create_task(_collect(tables, under_way)))
                     async with _broker_read(services):
                         yield {NOTE: metrics.connection_closed}
         finally:
