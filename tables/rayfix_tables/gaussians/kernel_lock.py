@@ -1,8 +1,8 @@
 """One process at a time compiles kernels or reads compiled ones.
 
 numba numbers the files of a kernel's compiled signatures. Two processes that find none number theirs alike, so that the
-index of one may name the code of the other: a process that reads it runs a kernel with arguments of other types, which
-ends in a crash. numba says when it takes and releases its compiler's lock, for a compilation and for a look into its
+index of one may name the code of the other: a process that reads it runs a kernel with arguments of other types, and
+may crash. numba says when it takes and releases its compiler's lock, for a compilation and for a look into its
 cache; here a lock on a file goes with it. What one process has compiled the others find afterwards.
 """
 
