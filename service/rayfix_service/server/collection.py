@@ -1,7 +1,7 @@
 """Collecting reference cycles while no request is under way.
 
 A collection of the oldest generation looks at every object that is left since the process became ready. With the
-reports of a long batch among them that takes up to 45 ms, in which nothing else is answered. It therefore waits for a
+reports of a long batch among them that takes 45 to 140 ms, in which nothing else is answered. It therefore waits for a
 moment without POST requests, when what is left is little. Younger generations take less than a millisecond, and
 are collected at once.
 """
@@ -9,14 +9,14 @@ are collected at once.
 import asyncio
 import gc
 from collections.abc import Callable
-from time import monotonic
+from contextlib import suppress
 
 from rayfix_service.http.telemetry.request_context import UnderWay
 
-_LOOK_SECONDS = 1.0
+_REST_SECONDS = 1.0
 
-_LATEST_SECONDS = 600.0
-"""Time without such a moment after which it is done nevertheless."""
+_LATEST_SECONDS = 3600.0
+"""Time without such a moment after which it is done nevertheless. The service's own work leaves no cycles."""
 
 _NEVER = 1_000_000_000
 
@@ -24,7 +24,7 @@ _NEVER = 1_000_000_000
 async def collect_while_idle(
     under_way: UnderWay,
     *,
-    look_seconds: float = _LOOK_SECONDS,
+    rest_seconds: float = _REST_SECONDS,
     latest_seconds: float = _LATEST_SECONDS,
     collect: Callable[[], object] = gc.collect,
 ) -> None:
@@ -33,8 +33,8 @@ async def collect_while_idle(
     Parameters
     ----------
     under_way : UnderWay
-    look_seconds : float
-        Between two looks at it.
+    rest_seconds : float
+        Between two collections at least.
     latest_seconds : float
         Between two collections at most.
     collect : callable
@@ -44,10 +44,9 @@ async def collect_while_idle(
     gc.freeze()
     young, middle, _ = gc.get_threshold()
     gc.set_threshold(young, middle, _NEVER)
-    last = monotonic()
     while True:
-        await asyncio.sleep(look_seconds)
-        is_due = not under_way.count or monotonic() - last > latest_seconds
-        if is_due and gc.get_count()[2]:  # nothing has grown old since the last one otherwise
+        await asyncio.sleep(rest_seconds)
+        with suppress(TimeoutError):
+            await asyncio.wait_for(under_way.until_none(), latest_seconds)
+        if gc.get_count()[2]:  # nothing has grown old since the last one otherwise
             collect()
-            last = monotonic()

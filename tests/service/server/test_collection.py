@@ -19,7 +19,7 @@ def collector() -> Iterator[None]:
     gc.set_threshold(*before)
 
 
-@pytest.mark.parametrize(("busy", "latest", "collects"), [(0, 1000.0, True), (1, 1000.0, False), (1, 0.05, True)])
+@pytest.mark.parametrize(("busy", "latest", "collects"), [(0, 1000.0, True), (2, 1000.0, False), (2, 0.05, True)])
 def test_old_objects_wait_for_an_idle_moment(busy: int, latest: float, collects: bool) -> None:
     """A collection in the midst of a long batch took 45 ms."""
     calls, under_way = [], UnderWay()
@@ -27,13 +27,15 @@ def test_old_objects_wait_for_an_idle_moment(busy: int, latest: float, collects:
     async def scenario() -> None:
         task = asyncio.create_task(
             collect_while_idle(
-                under_way, look_seconds=0.005, latest_seconds=latest, collect=lambda: calls.append(gc.collect())
+                under_way, rest_seconds=0.005, latest_seconds=latest, collect=lambda: calls.append(gc.collect())
             )
         )
         await asyncio.sleep(0.02)
         assert gc.get_threshold()[2] > 1_000_000
         assert gc.get_freeze_count() > 0
-        under_way.count = busy
+        for _ in range(busy):
+            under_way.begin()
+        await asyncio.sleep(0.02)  # the collection that waited already
         calls.clear()
         gc.collect(1)  # something may have grown old
         await asyncio.sleep(0.3)
@@ -45,12 +47,36 @@ def test_old_objects_wait_for_an_idle_moment(busy: int, latest: float, collects:
     assert bool(calls) is collects
 
 
+def test_the_end_of_the_last_request_is_an_idle_moment() -> None:
+    """One client that asks again and again leaves moments that a look every second does not meet."""
+    calls, under_way = [], UnderWay()
+
+    async def scenario() -> None:
+        under_way.begin()
+        under_way.begin()
+        task = asyncio.create_task(
+            collect_while_idle(under_way, rest_seconds=0.001, collect=lambda: calls.append(gc.collect()))
+        )
+        await asyncio.sleep(0.05)
+        under_way.end()
+        await asyncio.sleep(0.05)
+        calls.clear()
+        gc.collect(1)  # something may have grown old
+        under_way.end()
+        under_way.begin()
+        await asyncio.sleep(0.05)
+        task.cancel()
+
+    asyncio.run(scenario())
+    assert calls
+
+
 def test_nothing_is_collected_where_nothing_has_grown_old() -> None:
     calls = []
 
     async def scenario() -> None:
         task = asyncio.create_task(
-            collect_while_idle(UnderWay(), look_seconds=0.001, collect=lambda: calls.append(gc.collect()))
+            collect_while_idle(UnderWay(), rest_seconds=0.001, collect=lambda: calls.append(gc.collect()))
         )
         await asyncio.sleep(0.1)
         task.cancel()

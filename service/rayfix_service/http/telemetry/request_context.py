@@ -32,10 +32,27 @@ _PROPER = re.compile(r"[A-Za-z0-9._:/+=-]{1,128}")
 
 
 class UnderWay:
-    """How many POST requests are under way; others may be streams without an end."""
+    """Knows whether POST requests are under way; others may be streams without an end."""
 
     def __init__(self) -> None:
-        self.count = 0
+        self._count = 0
+        self._none = asyncio.Event()
+        self._none.set()
+
+    def begin(self) -> None:
+        """Take one more into account."""
+        self._count += 1
+        self._none.clear()
+
+    def end(self) -> None:
+        """Forget one."""
+        self._count -= 1
+        if not self._count:
+            self._none.set()
+
+    async def until_none(self) -> None:
+        """Wait until there is none."""
+        await self._none.wait()
 
 
 class RequestContext:
@@ -77,7 +94,8 @@ class RequestContext:
         token = REQUEST_ID.set(identifier)
         start = perf_counter()
         is_post = scope["method"] == "POST"
-        self._under_way.count += is_post
+        if is_post:
+            self._under_way.begin()
         try:
             await self._app(scope, receive, send_noting)
         except asyncio.CancelledError:  # not a defect: the process ends, or the client's key was removed
@@ -92,7 +110,8 @@ class RequestContext:
             if not status:
                 await problem_response(internal_problem())(scope, receive, send_noting)
         finally:
-            self._under_way.count -= is_post
+            if is_post:
+                self._under_way.end()
             self._note(scope, scope["method"], str(status or "none"), perf_counter() - start, identifier)
             REQUEST_ID.reset(token)
 
