@@ -144,7 +144,7 @@ def integrate(
         def at(points: Array, front: _Front = front, width: float = width, halvings: int = halvings) -> _Evaluated:
             level = max(-halvings, 0)
             levels = [station.levels[level] for station in stations]
-            found = _evaluated(points, front.block, width**2 / 12.0, resolution, levels, geometries, factors)
+            found = _evaluated(points, front.block, width**2 / 12.0, resolution, levels, geometries, factors, stop)
             return (
                 _with_sets(found, sets, points, front.block, width**2 / 12.0, resolution, together, level)
                 if sets
@@ -273,12 +273,14 @@ def _evaluated(
     levels: Sequence[BlockPaths],
     geometries: Sequence[tuple[NDArray[Any], ...]],
     factors: Sequence[PathFactor],
+    stop: Stop,
 ) -> _Evaluated:
-    """Evaluate all factors at points."""
+    """Evaluate all factors at points, unless it is stopped."""
     count = len(points)
     found = _Evaluated(np.zeros(count), np.zeros(count), *np.empty((2, len(factors), count)))
     density, told = np.empty(count), np.empty(count)
     for n, (paths, geometry, factor) in enumerate(zip(levels, geometries, factors, strict=True)):
+        stop.check()
         out = density, found.late[n], found.lost[n], told
         evaluate(points, blocks, spread, resolution, tuple(paths), geometry, tuple(factor), out)
         np.add(found.log_likelihood, np.log(density), out=found.log_likelihood)
