@@ -19,13 +19,13 @@ def write_json(document: Any) -> bytes:
 
 
 class JsonAnswer(Response):
-    """A JSON document, as :func:`write_json` writes it; bytes are one that is written."""
+    """A JSON document, as :func:`write_json` writes it."""
 
     media_type = "application/json"
 
     def render(self, content: Any) -> bytes:
         """Write the document."""
-        return content if isinstance(content, bytes) else write_json(content)
+        return write_json(content)
 
 
 class ResultsAnswer(Response):
